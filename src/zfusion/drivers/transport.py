@@ -1,0 +1,101 @@
+"""Zenoh sessions as zfusion wants them. With `live` and `taps`, the only importers of zenoh.
+
+Peers with explicit endpoints, no multicast, no gossip: a node is linked to whom its scenario names and to nobody else.
+A session is open at once, whether or not the others are there yet; links come up in the background as they appear, and
+liveliness tokens say who is there (docs/live.md).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault(
+    "ZENOH_RUNTIME",
+    "(rx: (handover: app), acc: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 1))",
+)  # one thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on
+
+import zenoh
+
+from zfusion.errors import InputError
+
+RETRY = {"period_init_ms": 20, "period_max_ms": 1000, "period_increase_factor": 1.5}
+"""A neighbour that comes up later is linked within 20 ms, one that is away for long is tried once a second."""
+
+LEASE_MS = 2000
+"""A peer that neither closes nor answers (stopped, cut off) counts as gone after this; one that dies, at once."""
+
+BLOCK_US = 60_000_000
+"""How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer is
+slower than we are, which is no reason to lose its messages."""
+
+LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
+"""About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """Where a session listens and whom it dials, as Zenoh endpoints (``tcp/127.0.0.1:7450``)."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+
+
+def open_session(
+    endpoints: Endpoints, *, low_latency: bool = False, config_file: Path | None = None, mode: str = "peer"
+) -> zenoh.Session:
+    """An open Zenoh session; InputError, naming the endpoint or file, where Zenoh refuses it.
+
+    A user's `config_file` comes first; the endpoints, where given, replace its own.
+    """
+    config = _base_config(config_file, mode, low_latency)
+    if endpoints.listen:
+        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
+    if endpoints.connect:
+        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
+        raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+
+
+def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zenoh.Config:
+    if config_file is not None:
+        try:
+            config = zenoh.Config.from_file(str(config_file))
+        except zenoh.ZError as error:
+            raise InputError(f"{config_file}: not a Zenoh configuration: {_reason(error)}") from None
+        config.insert_json5("timestamping/enabled", "true")
+        return config
+    config = zenoh.Config()
+    settings = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 1,  # nothing is scouted: do not wait for it
+        "listen/endpoints": [],
+        "connect/endpoints": [],
+        "connect/timeout_ms": -1,  # keep trying, in the background
+        "connect/exit_on_failure": False,
+        "connect/retry": RETRY,
+        "timestamping/enabled": True,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
+        "transport/shared_memory/enabled": False,
+    }
+    for key, value in (settings | (LOW_LATENCY if low_latency else {})).items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _listed(endpoints: Sequence[str]) -> str:
+    return ", ".join(endpoints) or "nothing"
+
+
+def _reason(error: Exception) -> str:
+    """Zenoh's own words, without the source positions that it adds."""
+    return str(error).split(" at /")[0].strip()

@@ -1,0 +1,67 @@
+"""Every error that zfusion raises on purpose, by whose fault it is.
+
+    ZfusionError
+    ├── InputError           what the user gave is wrong; nothing was started            (exit code 2)
+    │   ├── ScenarioError    a scenario file or object: names file, field, value, expectation
+    │   └── RecordingError   a recording that is missing, damaged or of another version
+    ├── RunError             what was started failed                                     (exit code 1)
+    └── MessageError         bytes from a peer that are not a legal message              (counted, never fatal)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+class ZfusionError(Exception):
+    """The root: `except ZfusionError` catches all that zfusion raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(ZfusionError):
+    """What the user gave is wrong, and nothing has been started."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong in an input: where, what is there, what is expected."""
+
+    field: str
+    """Path of the field, as in the file: ``sensors[2].H``."""
+    value: object
+    expected: str
+
+    def __str__(self) -> str:
+        shown = repr(self.value)
+        if len(shown) > 80:
+            shown = shown[:77] + "..."
+        return f"{self.field}: {self.expected} (is {shown})"
+
+
+class ScenarioError(InputError):
+    """A scenario that cannot be run; `problems` lists every field that is wrong."""
+
+    def __init__(self, source: str, problems: Iterable[Problem]) -> None:
+        self.source = source
+        self.problems = tuple(problems)
+        super().__init__("\n".join(f"{source}: {problem}" for problem in self.problems))
+
+
+class RecordingError(InputError):
+    """A recording that cannot be read: missing, damaged, not zfusion's, or of another version."""
+
+
+class RunError(ZfusionError):
+    """Something that was started did not end well."""
+
+
+class MessageError(ZfusionError):
+    """Bytes from a peer that are not a legal message; `reason` is the counter they are counted under."""
+
+    def __init__(self, reason: str, detail: str = "") -> None:
+        self.reason = reason
+        super().__init__(f"{reason}: {detail}" if detail else reason)

@@ -1,0 +1,86 @@
+"""Stage 2: the best affine combination of the neighbours' intermediate estimates.
+
+Source: Caballero-Águila et al., Information Fusion 45 (2019) 324-332, Theorem 2, in error form: the own estimate is the
+reference, z_j = x̂^j - x̂^i for the neighbours and z_0 = m - x̂^i for the prior mean, which is free information;
+
+    x̂_fused = x̂^i + c Z⁺ z,   Σ = P^(ii) - c Z⁺ cᵀ
+    c_j = P^(ii) - P^(ij),   Z_jl = P^(ii) - P^(il) - P^(ji) + P^(jl)
+    prior:  P^(0l) = P^(l0) = P^(ll),  P^(00) = Cov[x_k],  so c_0 = 0
+
+It is Theorem 2 exactly where m = 0, never worse elsewhere, and does not depend on where the origin lies.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zfusion.model.statistics import Array
+
+TWIN = 1e-13
+"""A difference of estimates whose variance is below this fraction of the own error's variance is rounding.
+
+Two neighbours that used the same measurements have the same estimate; its difference carries no weight."""
+
+SMALLEST_EIGENVALUE = 1e-12
+"""Eigenvalues of Z, scaled to a unit diagonal, below this are zero: those differences determine each other."""
+
+
+def fusion_weights(own: Array, cross: Array, among: Array, prior: Array) -> tuple[Array, Array]:
+    """Weights of the differences z = (z_0, z_1, ...) and the covariance of the fused error.
+
+    Args:
+        own: P^(ii), (..., nx, nx).
+        cross: P^(ij) for the d neighbours j that are fused, (..., d, nx, nx).
+        among: P^(jl) of those neighbours, (..., d, d, nx, nx).
+        prior: Cov[x_k], (nx, nx). Where it is not finite (an unstable system, long after its start) the prior
+            knows nothing and has no weight.
+
+    Returns:
+        (weights, Σ): (..., nx, (1 + d) nx), the prior's columns first, and (..., nx, nx).
+    """
+    *batch, d, nx, _ = cross.shape
+    n = (1 + d) * nx
+    everybody = np.empty((*batch, 1 + d, 1 + d, nx, nx))  # the prior is one more node, whose P^(0j) is P^(jj)
+    everybody[..., 1:, 1:, :, :] = among
+    each = among[..., np.arange(d), np.arange(d), :, :]
+    everybody[..., 0, 1:, :, :] = each
+    everybody[..., 1:, 0, :, :] = each
+    known = bool(np.isfinite(prior).all())
+    everybody[..., 0, 0, :, :] = prior if known else own
+    to_own = np.concatenate((own[..., None, :, :], cross), axis=-3)
+    c = own[..., None, :, :] - to_own
+    Z = (
+        own[..., None, None, :, :]
+        + everybody
+        - to_own[..., None, :, :, :]
+        - to_own.swapaxes(-1, -2)[..., None, :, :]
+    )
+    if not known:
+        Z[..., 0, :, :, :] = 0.0
+        Z[..., :, 0, :, :] = 0.0
+    Z = Z.swapaxes(-3, -2).reshape(*batch, n, n)
+    c = c.swapaxes(-3, -2).reshape(*batch, nx, n)
+    scale = np.tile(np.einsum("...aa->...a", own), 1 + d)
+    weights: Array = c @ _pseudo_inverse(Z, scale)
+    covariance = own - weights @ c.swapaxes(-1, -2)
+    return weights, 0.5 * (covariance + covariance.swapaxes(-1, -2))
+
+
+def fuse(own: Array, others: Array, mean: Array, weights: Array) -> Array:
+    """x̂^i + c Z⁺ z: own (nx,), others (d, nx) in the order of the weights, prior mean (nx,)."""
+    difference = np.concatenate((mean[None], others)) - own
+    fused: Array = own + weights @ difference.reshape(-1)
+    return fused
+
+
+def _pseudo_inverse(Z: Array, reference: Array) -> Array:
+    """Z⁺ on the unit-diagonal scaling; rows of variance below TWIN times `reference` have no part in it."""
+    variance = np.einsum("...aa->...a", Z)
+    alive = variance > TWIN * reference
+    scale = np.where(alive, 1.0 / np.sqrt(np.where(alive, variance, 1.0)), 0.0)
+    unit = Z * scale[..., :, None] * scale[..., None, :]
+    values, vectors = np.linalg.eigh(0.5 * (unit + unit.swapaxes(-1, -2)))
+    keep = values > SMALLEST_EIGENVALUE
+    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+    pseudo: Array = (vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2)
+    return pseudo * scale[..., :, None] * scale[..., None, :]

@@ -1,0 +1,70 @@
+"""What a method is to the node that drives it.
+
+A method declares its stages, the exchanges within a step, as data. At a step the node calls `begin` with its own
+measurement, publishes what it gets, waits for the neighbours' messages of that stage, calls `advance` with what
+arrived, publishes the next stage, and so on, until `advance` of the last stage returns the outcome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
+
+from zfusion.model.network import Network
+from zfusion.model.system import System
+from zfusion.model.types import Array, NodeId
+from zfusion.stages import Stage
+from zfusion.used_sets import Ledger, UsedSet
+
+Fields = Mapping[str, object]
+"""The stage's part of a message, by name: what `Stage.fields` declares."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All that a method may know when it starts at a node."""
+
+    node: NodeId
+    system: System
+    network: Network
+    """Whose neighbourhoods the method uses: the scenario's, after `Method.network`."""
+    born: int = 1
+    """First step of this life; a node that was restarted begins later, from the prior, having used nothing before."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A step's estimate."""
+
+    x: Array
+    """x̂_{k/k}, (nx,)."""
+    P: Array
+    """Predicted covariance of its error, (nx, nx)."""
+    used: UsedSet
+    """Whose messages of the last stage went into it."""
+    excluded: UsedSet = ()
+    """Whose messages were there and had to be left out, because their history is not known (a *fallback*)."""
+    ask: Mapping[NodeId, int] = field(default_factory=dict)
+    """Whose history is wanted, and from which step on."""
+
+
+class Method(Protocol):
+    """One estimator at one node. Deterministic: the same calls give the same results, bit for bit."""
+
+    name: ClassVar[str]
+    stages: ClassVar[tuple[Stage, ...]]
+
+    def __init__(self, setting: Setting) -> None: ...
+
+    @staticmethod
+    def network(graph: Network) -> Network:
+        """The graph whose neighbourhoods the method uses, given the scenario's."""
+
+    def begin(self, step: int, y: Array | None) -> Fields:
+        """Fields of the first stage, from the own measurement (ny,), None where the sensor had none."""
+
+    def advance(
+        self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger
+    ) -> Fields | Outcome:
+        """Take in what arrived of a stage, the own message included; the next stage's fields, or the outcome."""

@@ -1,0 +1,19 @@
+"""The types that every module of the model shares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+"""Vectors (n,) and matrices (rows, columns) of float64; read-only wherever a model object holds one."""
+
+NodeId = int | str
+"""A sensor's name. All ids of one system are of one kind, so that they have an order."""
+
+
+def sorted_ids(ids: Iterable[NodeId]) -> list[NodeId]:
+    """In their one order, in which everything is stacked and folded. TypeError if numbers and names are mixed."""
+    return sorted(ids)

@@ -1,0 +1,167 @@
+"""Used sets: whose measurements a node used at each step of its life, as a run-length list.
+
+A *used set* is the only trace that loss, lateness, a crash or a switched link leave in the mathematics
+(docs/method.md). A node tells its own with every intermediate estimate, with a short history, so that its
+neighbours can go on after messages were lost; what they still do not know is a gap here, to be asked for.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from zfusion.model.statistics import NodeId
+
+UsedSet = tuple[NodeId, ...]
+Run = tuple[int, UsedSet]
+"""(first step, used set from that step on)."""
+
+HISTORY_RUNS = 16
+"""Runs that a message carries. Only changes start a run: with no event one run says all; with a change at every
+step a neighbour may lose 16 messages in a row before it has to ask."""
+
+KEPT_RUNS = 16_384
+"""Runs that a node remembers of itself and of each neighbour: some MB at the worst, and what one answer can carry."""
+
+
+@dataclass(slots=True)
+class History:
+    """What is known of the used sets of one node from `born` to `last`, both included.
+
+    `born` is the first step of the node's present life: before it, it used nothing.
+    """
+
+    born: int
+    last: int = field(default=-1)
+    _starts: list[int] = field(default_factory=list)
+    _sets: list[UsedSet | None] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.last = max(self.last, self.born - 1)
+
+    def at(self, step: int) -> UsedSet | None:
+        """The used set of `step`; None where it is not known."""
+        if step < self.born:
+            return ()
+        if step > self.last:
+            return None
+        run = bisect_right(self._starts, step) - 1
+        return self._sets[run] if run >= 0 else None
+
+    def first_unknown(self, start: int, end: int) -> int | None:
+        """The first step in [start, end] whose used set is not known."""
+        step = max(start, self.born)
+        while step <= end:
+            run = bisect_right(self._starts, step) - 1
+            if step > self.last or run < 0 or self._sets[run] is None:
+                return step
+            step = self._starts[run + 1] if run + 1 < len(self._starts) else self.last + 1
+        return None
+
+    def learn(self, step: int, used: UsedSet, earlier: Sequence[Run] = ()) -> int | None:
+        """Take in what a message of `step` says: the set of that step and the runs before it.
+
+        `earlier` is ascending and speaks of every step from its first run's on, to `step` - 1. Returns the
+        first step of which something new is known now, None where nothing is.
+        """
+        if step == self.last + 1 and self._agrees(earlier):
+            self._append(step, used)
+            return step
+        before = [*earlier, (step, used)]
+        return self._overlay(before, step)
+
+    def runs(self, end: int, limit: int | None = None) -> list[Run]:
+        """The last known runs up to `end` in a row, at most `limit` of them; the first may be cut off there."""
+        found: list[Run] = []
+        for start, used in zip(reversed(self._starts), reversed(self._sets), strict=True):
+            if start > end:
+                continue
+            if used is None or (limit is not None and len(found) == limit):
+                break
+            found.append((start, used))
+        return found[::-1]
+
+    def _agrees(self, earlier: Sequence[Run]) -> bool:
+        """Whether the last run told is the one that is known to go on until `last` (all a neighbour repeats)."""
+        if not earlier:
+            return self.last == self.born - 1 or bool(self._sets)
+        start, used = earlier[-1]
+        return self.last >= self.born and self._sets[-1] == used and self._starts[-1] == start
+
+    def _append(self, step: int, used: UsedSet) -> None:
+        if not self._sets or self._sets[-1] != used:
+            self._starts.append(step)
+            self._sets.append(used)
+            if len(self._starts) > KEPT_RUNS:
+                del self._starts[0], self._sets[0]
+        self.last = step
+
+    def _overlay(self, told: Sequence[Run], end: int) -> int | None:
+        """Replace what is known of [told[0].start, end] by what is told; the first step that changed."""
+        start = told[0][0]
+        changed = self._first_difference(told, end)
+        if changed is None:
+            return None
+        tail = [(s, u) for s, u in self._known() if s > end]
+        if self.last > end and (not tail or tail[0][0] > end + 1):
+            tail.insert(0, (end + 1, self.at(end + 1)))
+        head: list[tuple[int, UsedSet | None]] = [(s, u) for s, u in self._known() if s < start]
+        if start > self.last + 1:
+            head.append((self.last + 1, None))
+        merged: list[tuple[int, UsedSet | None]] = []
+        for run in (*head, *told, *tail):
+            if not merged or merged[-1][1] != run[1]:
+                merged.append(run)
+        merged = merged[-KEPT_RUNS:]
+        self._starts, self._sets = [s for s, _ in merged], [u for _, u in merged]
+        self.last = max(self.last, end)
+        return changed
+
+    def _known(self) -> Iterable[tuple[int, UsedSet | None]]:
+        return zip(self._starts, self._sets, strict=True)
+
+    def _first_difference(self, told: Sequence[Run], end: int) -> int | None:
+        """The first step of [told[0].start, end] where `told` says something else than what is known."""
+        for number, (start, used) in enumerate(told):
+            stop = told[number + 1][0] if number + 1 < len(told) else end + 1
+            step = start
+            while step < stop:
+                if self.at(step) != used:
+                    return step
+                run = bisect_right(self._starts, step)
+                step = min(stop, self._starts[run] if run < len(self._starts) else self.last + 1)
+        return None
+
+
+class Ledger:
+    """What one node knows of the used sets in its neighbourhood, its own included."""
+
+    def __init__(self, own: NodeId, born: int) -> None:
+        self.own = own
+        self._of: dict[NodeId, History] = {own: History(born)}
+        self._changed: dict[NodeId, int] = {}
+
+    def of(self, node: NodeId) -> History | None:
+        """The history of a node's present life; None where nothing was heard of it yet."""
+        return self._of.get(node)
+
+    def learn(self, node: NodeId, born: int, step: int, used: UsedSet, earlier: Sequence[Run] = ()) -> None:
+        """Take in what a message of `node`, in the life that began at `born`, says of `step` and before."""
+        history = self._of.get(node)
+        if history is None or history.born < born:
+            history = self._of[node] = History(born)
+            self._note(node, born)
+        elif history.born > born:
+            return  # a former life speaks: its neighbours have begun anew with the present one
+        changed = history.learn(step, used, earlier)
+        if changed is not None:
+            self._note(node, changed)
+
+    def take_changes(self) -> dict[NodeId, int]:
+        """For each node of which something new is known since the last call: the first step it concerns."""
+        changes, self._changed = self._changed, {}
+        return changes
+
+    def _note(self, node: NodeId, step: int) -> None:
+        self._changed[node] = min(step, self._changed.get(node, step))
