@@ -19,6 +19,7 @@ def test_the_keys_are_those_of_the_contract() -> None:
     assert keys.truth_key("r1") == "zfusion/r1/truth"
     assert keys.node_token("r1", "mast") == "zfusion/r1/node/mast"
     assert keys.recorder_token("r1") == "zfusion/r1/recorder"
+    assert keys.recorder_status_key("r1") == "zfusion/r1/recorder/status"
     assert keys.status_key("r1", 3) == "zfusion/r1/node/3/status"
     assert keys.history_key("r1", 3) == "zfusion/r1/node/3/history"
 

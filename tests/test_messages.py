@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,8 @@ def test_the_largest_legal_message_is_not_too_large(ids: tuple[int, ...] | tuple
 ILLEGAL = [
     (MEASUREMENT, {"v": 2}, Reason.VERSION),
     (MEASUREMENT, {"v": "1"}, Reason.VERSION),
+    (MEASUREMENT, {"v": True}, Reason.VERSION),
+    (MEASUREMENT, {"v": 1.0}, Reason.VERSION),
     (MEASUREMENT, {"node": 1}, Reason.WRONG_NODE),
     (MEASUREMENT, {"node": "2"}, Reason.WRONG_NODE),
     (MEASUREMENT, {"node": 2.0}, Reason.WRONG_NODE),
@@ -309,10 +312,8 @@ READS = [*(decoder(stage).decode for stage in BUILT_IN), read_stamp, decode_any]
 
 def assert_reads_or_refuses(data: bytes) -> None:
     for read in READS:
-        try:
+        with suppress(MessageError):
             read(data)
-        except MessageError as error:
-            assert error.reason in set(Reason)
 
 
 @given(st.binary(max_size=300))
@@ -320,11 +321,12 @@ def test_any_bytes_are_a_message_or_a_message_error(data: bytes) -> None:
     assert_reads_or_refuses(data)
 
 
+leaf = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
 plain = st.recursive(
-    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(max_size=3),
+    leaf | st.binary(max_size=3),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
     max_leaves=8,
-)  # fmt: skip
+)
 
 
 @given(st.data())
@@ -392,7 +394,7 @@ def test_a_measurement_may_be_nil_in_its_schema_too() -> None:
     ],
 )
 def test_tables_that_cannot_be_are_refused(build: Callable[[], object]) -> None:
-    with pytest.raises(ValueError, match="expected|twice|more than one|shape"):
+    with pytest.raises(ValueError, match=r"expected|twice|more than one|shape"):
         build()
 
 

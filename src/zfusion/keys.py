@@ -89,6 +89,11 @@ def recorder_token(run: str) -> str:
     return f"{ROOT}/{run}/recorder"
 
 
+def recorder_status_key(run: str) -> str:
+    """Where the recorder answers what it has so far."""
+    return f"{recorder_token(run)}/status"
+
+
 def whole_run(run: str) -> str:
     """A key expression that every key of the run matches: messages and liveliness tokens alike."""
     return f"{ROOT}/{run}/**"

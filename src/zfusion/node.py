@@ -16,10 +16,11 @@ can happen to a message ends in a counter: late, duplicate, too early, from a fo
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from zfusion.gaps import GapCounter
 from zfusion.methods.protocol import Fields, Method, Outcome
 from zfusion.model.types import Array, NodeId, sorted_ids
 from zfusion.stages import ESTIMATE, EVENT, Message
@@ -71,6 +72,8 @@ class EdgeCounters:
     """By stage: not there at the deadline although expected."""
     refused: Counter[str] = field(default_factory=Counter)
     """By reason: duplicate, too_early, former_life, stray."""
+    gaps: defaultdict[str, GapCounter] = field(default_factory=lambda: defaultdict(GapCounter))
+    """By stage: the account of the sender's own counter, which tells what was lost on the way."""
 
 
 class Node:
@@ -132,6 +135,11 @@ class Node:
         expected, step, arrived = self._expected, self.step, self._arrived
         return tuple(j for j in self.neighbours if j not in arrived and expected.get(j, NEVER) <= step)
 
+    @property
+    def silent(self) -> tuple[NodeId, ...]:
+        """The neighbours that are not waited for at this step: gone, or not heard of since they came back."""
+        return tuple(j for j in self.neighbours if self._expected.get(j, NEVER) > self.step)
+
     def begin(self, step: int, y: Array | None, now: int, start: int | None = None) -> list[Effect]:
         """Begin a step with the own measurement, None where the sensor has none.
 
@@ -160,6 +168,7 @@ class Node:
             (message.step, stage),
             (self.step, self._stage if self._stage >= 0 else len(self._stages)),
         )
+        counters.gaps[message.stage].observe(message.born, message.seq)
         self._note_presence(message, late=at < present)
         if at < present:
             counters.late[message.stage] += 1

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
@@ -29,8 +30,8 @@ LEASE_MS = 2000
 """A peer that neither closes nor answers (stopped, cut off) counts as gone after this; one that dies, at once."""
 
 BLOCK_US = 60_000_000
-"""How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer is
-slower than we are, which is no reason to lose its messages."""
+"""How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer
+is slower than we are, which is no reason to lose its messages."""
 
 LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
 """About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
@@ -61,6 +62,23 @@ def open_session(
     except zenoh.ZError as error:
         where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
         raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+
+
+def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """A publisher to the other sessions on `key`: nothing waits to be batched, nothing is dropped for being too much."""
+    return session.declare_publisher(
+        key,
+        express=True,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        allowed_destination=zenoh.Locality.REMOTE,
+        encoding=zenoh.Encoding("application/msgpack"),
+    )
+
+
+def on_zenoh_thread(callback: Callable[[Any], None]) -> Any:
+    """A callback run on Zenoh's own thread, for one that only leaves a notice: a thread of its own would keep the process
+    from exiting."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zenoh.Config:

@@ -43,7 +43,7 @@ class Centralized:
         self._node = node
         neighbourhood = setting.network.neighbours(node)
         self._neighbourhood = neighbourhood
-        sizes = {j: system.sensor(j).ny for j in neighbourhood}
+        sizes = {j: system.by_id[j].ny for j in neighbourhood}
         self._models = StepModels(lambda: step_models(system, neighbourhood))
         start = prior_moments(system) if setting.born == 1 else self._models.at(setting.born - 1)[1]
         self._filter = LeastSquaresFilter(neighbourhood, sizes, start.mean, start.covariance)
@@ -98,7 +98,7 @@ class TwoStage(Centralized):
         self._neighbours = Neighbourhood(
             self._node,
             {j: network.neighbours(j) for j in self._neighbourhood},
-            {j: system.sensor(j).ny for j in sensors},
+            {j: system.by_id[j].ny for j in sensors},
             lambda: step_models(system, sensors),
             prior_moments(system),
         )

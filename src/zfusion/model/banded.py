@@ -56,8 +56,8 @@ Blocks = Callable[[int], tuple[Array, Array]]
 def root_rows(blocks: Blocks, constant_from: int | None) -> Iterator[RootRow]:
     """Rows k = 1, 2, ... of a square root, without end; raises Indefinite at the first row that cannot be.
 
-    From step `constant_from` on `blocks` is taken to stay the same (None: never). Once rows have settled, which singular
-    covariances may never do, the same object comes again and again.
+    From step `constant_from` on `blocks` is taken to stay the same (None: never). Once rows have settled, which those
+    of singular covariances may never do, the same object comes again and again.
     """
     scale, G0, G1 = _scaled(*blocks(1), None)
     root = _cholesky(G0, 1)
@@ -81,7 +81,7 @@ def _scaled(G0: Array, G1: Array, scale_before: Array | None) -> tuple[Array, Ar
     scale = np.sqrt(np.maximum(np.diag(G0), 0.0))[:, None]
     before = scale if scale_before is None else scale_before
     now_dead, before_dead = scale[:, 0] == 0, before[:, 0] == 0
-    if G0[now_dead].any() or scale_before is not None and (G1[now_dead].any() or G1[:, before_dead].any()):
+    if G0[now_dead].any() or (scale_before is not None and (G1[now_dead].any() or G1[:, before_dead].any())):
         raise Indefinite("a component without variance is correlated")
     unit, unit_before = np.where(scale > 0, scale, 1.0), np.where(before > 0, before, 1.0)
     return scale, G0 / (unit * unit.T) + SLACK * np.eye(len(G0)), G1 / (unit * unit_before.T)
@@ -89,9 +89,10 @@ def _scaled(G0: Array, G1: Array, scale_before: Array | None) -> tuple[Array, Ar
 
 def _cholesky(matrix: Array, k: int) -> Array:
     try:
-        return np.linalg.cholesky(matrix)
+        root: Array = np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
         raise Indefinite(f"a variance given the past is negative at step {k}") from None
+    return root
 
 
 def _settled(before: RootRow, row: RootRow, scale: Array) -> bool:
@@ -114,7 +115,8 @@ def spectral_floor(G0: Array, G1: Array) -> float:
 
     def floor(theta: Array) -> Array:
         turn = np.exp(-1j * theta)[:, None, None]
-        return np.linalg.eigvalsh((G0[at] + G1[at] * turn + G1[at].T / turn) / scale)[:, 0]
+        eigenvalues: Array = np.linalg.eigvalsh((G0[at] + G1[at] * turn + G1[at].T / turn) / scale)
+        return eigenvalues[:, 0]
 
     theta = np.linspace(0, np.pi, FREQUENCIES)
     width = theta[1]

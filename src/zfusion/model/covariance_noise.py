@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, islice
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -68,10 +69,13 @@ class CovarianceNoise(NoiseModel):
     S1: BySensor = field(default_factory=dict)
     S2: BySensor = field(default_factory=dict)
     _settled: dict[tuple[NodeId, ...], NoiseCovariances] = field(default_factory=dict, init=False, repr=False)
+    _roots: dict[Component, _RootBlocks] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "Q", _checked_covariance("Q", self.Q))
+        variances = {(i, j): _checked_covariance(f"R[{i!r}, {j!r}]", s) for (i, j), s in self.R.items() if i == j}
+        object.__setattr__(self, "R", {**self.R, **variances})
         checked = {
-            "Q": _covariances("Q", self.Q),
             "Q1": self.Q1 and checked_schedule("Q1", self.Q1, (self.nx, self.nx)),
             "R": {pair: self._checked_pair("R", pair, s) for pair, s in self.R.items()},
             "R1": {pair: self._checked_pair("R1", pair, s) for pair, s in self.R1.items()},
@@ -175,14 +179,19 @@ class CovarianceNoise(NoiseModel):
         constant = None if self.constant_from is None else self.constant_from + 2
         return root_rows(partial(self.blocks, component), constant)
 
+    def root(self, component: Component) -> _RootBlocks:
+        """The same by blocks of steps, made as they are asked for; one for all samplers."""
+        if component not in self._roots:
+            size = sum(self.sizes[i] for i in component.ids) + (self.nx if component.process else 0)
+            self._roots[component] = _RootBlocks(partial(self.root_rows, component), size)
+        return self._roots[component]
+
     def _checked_pair(self, name: str, pair: Pair, schedule: Schedule[Array]) -> Schedule[Array]:
         where = f"{name}[{pair[0]!r}, {pair[1]!r}]"
         for i in pair:
             if i not in self.sizes:
                 raise ModelError(where, i, f"expected sensors with an R[i, i]: {list(self.sizes)}")
-        if name == "R" and pair[0] == pair[1]:
-            return _covariances(where, schedule)
-        if name == "R" and pair[::-1] in self.R:
+        if name == "R" and pair[0] != pair[1] and pair[::-1] in self.R:
             raise ModelError(where, pair, "expected each pair in one order only")
         return checked_schedule(where, schedule, (self.sizes[pair[0]], self.sizes[pair[1]]))
 
@@ -194,11 +203,14 @@ class CovarianceNoise(NoiseModel):
     def _check_definite(self, component: Component) -> None:
         members = ", ".join((["w"] if component.process else []) + [f"v^{i}" for i in component.ids])
         expected = f"expected a positive semi-definite joint covariance of {members} over all steps"
-        if self.constant_from == 0:
-            floor = spectral_floor(*self.blocks(component, 2))
+        if self.constant_from is not None:
+            floor = spectral_floor(*self.blocks(component, self.constant_from + 2))
             if floor < -SLACK:
                 raise ModelError("noise", floor, f"{expected}; this is its spectral density's lowest eigenvalue")
-            return
+        if self.constant_from != 0:
+            self._check_first_rows(component, expected)
+
+    def _check_first_rows(self, component: Component, expected: str) -> None:
         rows = self.root_rows(component)
         try:
             for _ in range(self.repeats_after + FACTORED_STEPS):
@@ -207,18 +219,51 @@ class CovarianceNoise(NoiseModel):
             raise ModelError("noise", str(reason), expected) from None
 
 
+class _RootBlocks:
+    """A square root of one component's joint covariance by blocks of steps, k = 0 with a row of zeros.
+
+    It is the same for all seeds. Going far back means to begin again.
+    """
+
+    def __init__(self, rows: Callable[[], Iterator[RootRow]], size: int) -> None:
+        self._begin = rows
+        self.size = size
+        self._rows: Iterator[RootRow] = iter(())
+        self._next: float = inf
+        """The block that `_rows` comes to next."""
+        self.block = Recent(self._make)
+        """The rows of a block's steps: A and B are (BLOCK, n, n), or (n, n) where all are the same."""
+
+    def _make(self, block: int) -> RootRow:
+        if block < self._next:
+            zero = np.zeros((self.size, self.size))
+            self._rows = chain([RootRow(zero, zero)], self._begin())
+            self._next = 0
+        skipped = (block - int(self._next)) * BLOCK
+        self._next = block + 1
+        try:
+            rows = list(islice(self._rows, skipped, skipped + BLOCK))
+        except Indefinite as reason:
+            self._next = inf
+            raise RunError(f"the covariances of the noises contradict one another: {reason}") from None
+        if rows[0] is rows[-1]:
+            return rows[0]
+        return RootRow(np.array([row.A for row in rows]), np.array([row.B for row in rows]))
+
+
 class CovarianceSampler:
     """Draws the noises of one component after the other, as they are asked for."""
 
     def __init__(self, noise: CovarianceNoise, seeds: Seeds) -> None:
         self._nx = noise.nx
-        self._sequences: dict[NodeId | None, _Sequence] = {}  # None stands for w
+        self._sequences: dict[NodeId | None, Recent[Array]] = {}  # None stands for w
         self._rows: dict[NodeId, slice] = {}
         for component in noise.components:
-            sequence = _Sequence(noise, component, seeds)
+            sequence = Recent(_Sequence(component, noise.root(component), seeds).values)
+            start = 0
             if component.process:
                 self._sequences[None] = sequence
-            start = noise.nx if component.process else 0
+                start = noise.nx
             for i in component.ids:
                 self._sequences[i] = sequence
                 self._rows[i] = slice(start, start + noise.sizes[i])
@@ -226,57 +271,38 @@ class CovarianceSampler:
 
     def process(self, block: int) -> Array:
         """w_{k-1} for the steps k of the block, (BLOCK, nx)."""
-        return self._sequences[None].values(block)[:, : self._nx]
+        return self._sequences[None](block)[:, : self._nx]
 
     def sensor(self, i: NodeId, block: int) -> Array:
         """v^i_k for the steps k of the block, (BLOCK, ny_i)."""
-        return self._sequences[i].values(block)[:, self._rows[i]]
+        return self._sequences[i](block)[:, self._rows[i]]
 
 
 class _Sequence:
     """The z_k of one component, all of it together: z_k = A_k u_k + B_k u_{k-1}, with white Gaussian u_k."""
 
-    def __init__(self, noise: CovarianceNoise, component: Component, seeds: Seeds) -> None:
-        self._noise = noise
-        self._component = component
+    def __init__(self, component: Component, root: _RootBlocks, seeds: Seeds) -> None:
+        self._name = component.name
+        self._root = root
         self._seeds = seeds
-        self._size = sum(noise.sizes[i] for i in component.ids) + (noise.nx if component.process else 0)
         self._white = Recent(self._draw)
-        self._rows: Iterator[RootRow] = iter(())
-        self._next = -1
-        """The block that `_rows` comes to next."""
-        self.values: Callable[[int], Array] = Recent(self._values)
-        """z_k for the steps k of a block, (BLOCK, size)."""
 
-    def _draw(self, block: int) -> Array:
-        rng = self._seeds.generator("noise", self._component.name, block=block)
-        return rng.standard_normal((BLOCK, self._size))
-
-    def _values(self, block: int) -> Array:
+    def values(self, block: int) -> Array:
+        """z_k for the steps k of a block, (BLOCK, n)."""
+        A, B = self._root.block(block)
         now = self._white(block)
         before = np.concatenate([self._white(block - 1)[-1:], now[:-1]])
-        rows = self._root_rows(block)
-        if rows[0] is rows[-1]:
-            return now @ rows[0].A.T + before @ rows[0].B.T
-        A, B = np.array([row.A for row in rows]), np.array([row.B for row in rows])
+        if A.ndim == 2:
+            return now @ A.T + before @ B.T
         values: Array = np.einsum("kij,kj->ki", A, now) + np.einsum("kij,kj->ki", B, before)
         return values
 
-    def _root_rows(self, block: int) -> list[RootRow]:
-        """Those of the block's steps; going back means to begin again."""
-        if not 0 <= self._next <= block:
-            zero = np.zeros((self._size, self._size))
-            self._rows = chain([RootRow(zero, zero)], self._noise.root_rows(self._component))
-            self._next = 0
-        skipped = (block - self._next) * BLOCK
-        self._next = block + 1
-        try:
-            return list(islice(self._rows, skipped, skipped + BLOCK))
-        except Indefinite as reason:
-            raise RunError(f"the covariances of the noises contradict one another: {reason}") from None
+    def _draw(self, block: int) -> Array:
+        size = self._root.size
+        return self._seeds.generator("noise", self._name, block=block).standard_normal((BLOCK, size))
 
 
-def _covariances(where: str, schedule: Schedule[Array]) -> Schedule[Array]:
+def _checked_covariance(where: str, schedule: Schedule[Array]) -> Schedule[Array]:
     checked = checked_schedule(where, schedule, (None, None))
     for n, item in enumerate(checked.items):
         covariance_matrix(where if len(checked.items) == 1 else f"{where}[{n}]", item)

@@ -15,6 +15,7 @@ from math import prod
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zfusion.model.checks import ModelError, covariance_matrix, finite_array, semidefinite_factor
 from zfusion.model.distributions import Distribution
@@ -59,6 +60,11 @@ class Schedule(Generic[T]):
     def at(self, k: int) -> T:
         """What holds at step k; ValueError before the first step."""
         return self.items[self.index(k)]
+
+    def indices(self, first: int, count: int) -> NDArray[np.intp]:
+        """Positions in `items` of what holds at `count` steps from `first` on; before the first step, item 0's."""
+        n = np.maximum(np.arange(first, first + count) - self.first, 0)
+        return n % len(self.items) if self.after == "cycle" else np.minimum(n, len(self.items) - 1)
 
     @property
     def period(self) -> int:

@@ -180,7 +180,8 @@ class MovingAverageNoise(NoiseModel):
     def _check_structure(self) -> None:
         """Refuse a covariance outside the model's structure: the contributions to it must cancel."""
         for (left, right, d), pairs in self._outside_structure().items():
-            for k in range(max(0, -d), self.repeats_after + abs(d) + 1):
+            first = 0 if left == "w" else 1
+            for k in range(max(first, 1 - d), self.repeats_after + abs(d) + 1):
                 products = [(a.matrix.at(k), self.white[a.source].covariance, b.matrix.at(k + d)) for a, b in pairs]
                 value = sum(A @ C @ B.T for A, C, B in products)
                 size = sum(np.abs(A) @ np.abs(C) @ np.abs(B).T for A, C, B in products)
@@ -246,7 +247,7 @@ class MovingAverageSampler:
             eta = np.concatenate([eta[offset:], self._white[tap.source](block + 1)[:offset]])
         if len(tap.matrix.items) == 1:
             return eta @ tap.matrix.items[0].T
-        matrices = np.array([tap.matrix.at(max(k, 0)) for k in range(first, first + BLOCK)])
+        matrices = np.array(tap.matrix.items)[tap.matrix.indices(first, BLOCK)]
         term: Array = np.einsum("kij,kj->ki", matrices, eta)
         return term
 

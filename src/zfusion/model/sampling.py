@@ -52,9 +52,12 @@ class SamplePath:
             raise ValueError(f"there is no step {k}: the first is {first}")
         block, row = divmod(k, BLOCK)
         value: Array = blocks(block)[row]
+        self._check_not_lost(k)
+        return value
+
+    def _check_not_lost(self, k: int) -> None:
         if k >= self._lost_at:
             raise RunError(f"the true state has left the range of floating-point numbers at step {self._lost_at}")
-        return value
 
     def _initial_state(self) -> Array:
         factor = semidefinite_factor(self._system.initial_covariance)
@@ -64,6 +67,7 @@ class SamplePath:
     def _state_block(self, block: int) -> Array:
         while len(self._entries) <= block:
             self._entries.append(self._roll(len(self._entries) - 1)[-1].copy())
+            self._check_not_lost(len(self._entries) * BLOCK - BLOCK)
         return self._roll(block)
 
     def _roll(self, block: int) -> Array:
@@ -97,7 +101,7 @@ def _draw(schedule: Schedule[RandomMatrix], first: int, streams: Streams) -> Arr
     """The matrices of BLOCK steps from `first` on, (BLOCK, rows, columns); before the schedule begins, any."""
     if len(schedule.items) == 1:
         return schedule.items[0].sample(streams, BLOCK)
-    indices = np.array([schedule.index(max(k, schedule.first)) for k in range(first, first + BLOCK)])
+    indices = schedule.indices(first, BLOCK)
     matrices = np.empty((BLOCK, *schedule.items[0].shape))
     for index in np.unique(indices):
         at = indices == index

@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self, TypedDict, Unpack
+from typing import Annotated, Any, Self, TypedDict, TypeVar, Unpack
 
 import tomli_w
 from pydantic import Field, PrivateAttr, TypeAdapter, ValidationInfo, model_validator
@@ -42,6 +42,8 @@ from zfusion.model.schema.run import (
 from zfusion.model.schema.system import NoiseSpec, SensorSpec, SystemSpec
 from zfusion.model.system import System
 from zfusion.model.types import NodeId, sorted_ids
+
+T = TypeVar("T")
 
 FINGERPRINT_VERSION = 1
 """Of what a fingerprint is made of; scenarios of different versions never look alike."""
@@ -158,7 +160,7 @@ class Scenario(Spec):
     def source_of(self, i: NodeId) -> Source:
         """Where sensor i's measurements come from: paths absolute, "{id}" filled in."""
         source = self._entries[i].source or self.source
-        return source.with_paths(self._absolute).for_sensor(i)
+        return source.with_paths(lambda path: str(self.absolute(path))).for_sensor(i)
 
     @property
     def truth_known(self) -> bool:
@@ -199,12 +201,13 @@ class Scenario(Spec):
 
     def _document(self) -> dict[str, Any]:
         """What was set, as a TOML file holds it."""
-        return _without_none(self.model_dump(by_alias=True, exclude_unset=True))
+        document: dict[str, Any] = _without_none(self.model_dump(by_alias=True, exclude_unset=True))
+        return document
 
     def to_toml(self) -> str:
         """The text of a file with what was set, which `from_toml` reads as an equal scenario."""
         text = tomli_w.dumps(self._document())
-        text = ITEMS_ON_LINES.sub(lambda found: f"[{' '.join(found[1].split())}"[:-1] + "]", text)
+        text = ITEMS_ON_LINES.sub(_on_one_line, text)
         return ROW_ON_LINE.sub(r"[\1]", text)
 
     @cached_property
@@ -220,7 +223,8 @@ class Scenario(Spec):
             "system": self.system_spec.model_dump(exclude_none=True),
             "sensors": sensors,
             "noise": self.noise.model_dump(exclude_none=True),
-            "network": [[i, [[j, self.network.weight(i, j)] for j in self.network.neighbours(i)]] for i in self.ids],
+            "network": [(i, self.network.neighbours(i)) for i in self.ids],
+            "weights": sorted(self.network.weights.items()),
             "method": self.method.model_dump(),
             "timing": self.timing.facts,
             "seed": self.seed,
@@ -274,10 +278,15 @@ def _parsed(text: str, source: str) -> dict[str, Any]:
     raise ScenarioError(source, [problem])
 
 
+def _on_one_line(items: re.Match[str]) -> str:
+    lines = [line.strip() for line in items[1].split("\n")]
+    return f"[{' '.join(lines).strip().removesuffix(',')}]"
+
+
 def _overridden(document: Mapping[str, Any], overrides: Overrides) -> dict[str, Any]:
     """The document with the overrides that are not None worked in."""
     given = {key: value for key, value in overrides.items() if value is not None}
-    changed = {**document, **{key: given[key] for key in ("steps", "seed") if key in given}}
+    changed: dict[str, Any] = {**document, **{key: given[key] for key in ("steps", "seed") if key in given}}
     method = document.get("method")
     if "method" in given and given["method"] != (method.get("name") if isinstance(method, Mapping) else method):
         changed["method"] = {"name": given["method"]}
@@ -292,16 +301,24 @@ def _readable(document: Mapping[str, Any], found: Iterable[Located]) -> Parts:
     """The pieces of a faulty document in which nothing is wrong but keys too many."""
     pruned = without(document, [fault.path for fault in found if fault.is_unknown_key])
     faulty = {fault.path[:depth] for fault in found if not fault.is_unknown_key for depth in (1, 2)}
-    entries = pruned.get("sensors")
-    sensors = [] if ("sensors",) in {fault.path for fault in found} else entries
+
+    def piece(reader: TypeAdapter[T], name: str, default: T | None) -> T | None:
+        if (name,) in faulty:
+            return None
+        return reader.validate_python(pruned[name]) if name in pruned else default
+
+    all_are_faulty = any(fault.path == ("sensors",) for fault in found)
+    entries = () if all_are_faulty else pruned["sensors"]
     return Parts(
+        system=piece(TypeAdapter(SystemSpec), "system", None),
         sensors=tuple(
-            None if ("sensors", n) in faulty else SENSOR.validate_python(entry) for n, entry in enumerate(sensors or ())
+            None if ("sensors", n) in faulty else TypeAdapter(SensorSpec).validate_python(entry)
+            for n, entry in enumerate(entries)
         ),
-        **{
-            name: None if (name,) in faulty else reader.validate_python(pruned.get(name, default))
-            for name, (reader, default) in PIECES.items()
-        },
+        noise=piece(TypeAdapter(NoiseSpec), "noise", NoiseSpec()),
+        network=piece(TypeAdapter(AnyGraph), "network", None),
+        source=piece(TypeAdapter(Source), "source", SimulationSource()),
+        transport=piece(TypeAdapter(TransportSpec), "transport", TransportSpec()),
     )
 
 
@@ -318,13 +335,3 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_none(item) for item in value]
     return value
-
-
-SENSOR: TypeAdapter[SensorSpec] = TypeAdapter(SensorSpec)
-PIECES: Mapping[str, tuple[TypeAdapter[Any], Any]] = {
-    "system": (TypeAdapter(SystemSpec), None),
-    "noise": (TypeAdapter(NoiseSpec), {}),
-    "network": (TypeAdapter(AnyGraph), None),
-    "source": (TypeAdapter(Source), {"kind": "simulation"}),
-    "transport": (TypeAdapter(TransportSpec), {}),
-}

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from zfusion.errors import InputError
+
 Array = NDArray[np.float64]
 """Vectors (n,) and matrices (rows, columns) of float64; read-only wherever a model object holds one."""
 
@@ -15,5 +17,8 @@ NodeId = int | str
 
 
 def sorted_ids(ids: Iterable[NodeId]) -> list[NodeId]:
-    """In their one order, in which everything is stacked and folded. TypeError if numbers and names are mixed."""
+    """In their one order, in which everything is stacked and folded. InputError if numbers and names are mixed."""
+    ids = list(ids)
+    if len({isinstance(i, str) for i in ids}) > 1:
+        raise InputError(f"expected ids that are all integers or all names: {ids}")
     return sorted(ids)

@@ -4,7 +4,7 @@ The only importers of mcap. `RecordingWriter` writes them, `Recording` reads the
 `zfusion.recording.info` says what is on one, `zfusion.recording.export` takes the numbers out.
 """
 
-from zfusion.recording.gaps import GapCounter, Gaps
+from zfusion.gaps import GapCounter, Gaps
 from zfusion.recording.provenance import arithmetic_differences
 from zfusion.recording.reader import Record, Recording
 from zfusion.recording.writer import RecordingWriter

@@ -69,7 +69,7 @@ def frames(file: BinaryIO, size: int, finished: bool) -> Iterator[Frame]:
         head = file.read(_FRAME.size)
         opcode, length = _FRAME.unpack(head) if len(head) == _FRAME.size else (-1, 0)
         cut_off = opcode < 0 or length > size - position - _FRAME.size
-        if not finished and (cut_off or (opcode == 0 and _only_zeros_follow(file))):
+        if not finished and (cut_off or (not any(head) and _only_zeros_follow(file))):
             return
         if opcode not in _OPCODES:
             raise Damage(position, f"no record of a type {opcode}" if opcode >= 0 else "half a record")

@@ -34,7 +34,7 @@ from zfusion.recording.container import (
     read_at,
     unpack_chunk,
 )
-from zfusion.recording.gaps import Gaps
+from zfusion.gaps import Gaps
 
 _EVER = 2**64
 """Later than every time that an MCAP file can say."""
@@ -130,12 +130,9 @@ class Recording:
             contents = _survey(file, size)
             _check_layout(contents)
             return cls(path, file, contents, size)
-        except RecordingError as error:
+        except (RecordingError, UnicodeDecodeError, OSError) as error:
             file.close()
             raise RecordingError(f"{path}: {error}") from error
-        except BaseException:
-            file.close()
-            raise
 
     @property
     def statistics(self) -> Mapping[str, Gaps] | None:
@@ -296,7 +293,7 @@ def _check_layout(contents: _Contents) -> None:
             f"is a recording of format {facts.get('format')}; this zfusion reads format {layout.FORMAT}"
         )
     if layout.SCENARIO not in contents.attachments:
-        raise RecordingError(f"has no {layout.SCENARIO}: it was broken off at byte {contents.readable}")
+        raise RecordingError(f"has no {layout.SCENARIO}: it ends at byte {contents.readable}")
 
 
 def _note(contents: _Contents, size: int) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +21,7 @@ from zfusion import keys
 from zfusion.errors import MessageError, RecordingError, RunError
 from zfusion.messages import VERSION, json_schema, read_stamp
 from zfusion.recording import layout
-from zfusion.recording.gaps import GapCounter
+from zfusion.gaps import GapCounter, Gaps
 from zfusion.recording.provenance import clocks, machine, software
 from zfusion.stages import BUILT_IN, Stage
 
@@ -44,7 +44,7 @@ class RecordingWriter:
     `path` must be in a directory that is there; a file there is replaced. `stages` are those of the method beside the
     built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `facts` are what
     else the caller knows of the run and wants on the file. RecordingError if the file cannot be made; RunError from
-    any method when writing fails (disk full).
+    any method when writing fails (disk full): the file is closed then, and readable up to there.
     """
 
     def __init__(
@@ -82,6 +82,8 @@ class RecordingWriter:
         Bytes that are not a legal message are recorded as they are, and counted. Arrival times that go back are
         raised to the last one, so that the order on the file is the order of time.
         """
+        if self._file.closed:
+            raise RunError(f"{self.path}: the recording is closed")
         channel = self._channels.get(topic) or self._add_channel(topic)
         if channel is None:
             self._refused += 1
@@ -96,7 +98,7 @@ class RecordingWriter:
         try:
             self._writer.add_message(channel.id, log_time, data, t_ns or log_time, seq & 0xFFFF_FFFF)
         except OSError as error:
-            raise self._failure(error) from error
+            raise self._fail(error) from error
         self.messages += 1
 
     def flush(self) -> None:
@@ -114,27 +116,27 @@ class RecordingWriter:
         *,
         sent: Mapping[str, Mapping[int, int]] | None = None,
         facts: Mapping[str, str] | None = None,
-    ) -> None:
-        """Write the accounts and the indexes, and close the file. Doing it again does nothing.
+    ) -> dict[str, Gaps]:
+        """Write the accounts and the indexes, and close the file; the accounts, by topic. Doing it again does nothing.
 
         `sent` tells, for the topics whose senders said so, how many messages they had put there, by their lives'
         first steps; `facts` are what the caller knows of how the run ended (queue, drops).
         """
-        if self._file.closed:
-            return
         sent = sent or {}
-        accounts = {topic: asdict(channel.counter.gaps(sent.get(topic))) for topic, channel in self._channels.items()}
-        accounts |= {
-            topic: asdict(GapCounter().gaps(counts)) for topic, counts in sent.items() if topic not in accounts
-        }
+        accounts = {topic: channel.counter.gaps(sent.get(topic)) for topic, channel in self._channels.items()}
+        accounts |= {topic: GapCounter().gaps(counts) for topic, counts in sent.items() if topic not in accounts}
+        if self._file.closed:
+            return accounts
         end = clocks() | {"messages": str(self.messages), "refused": str(self._refused)} | dict(facts or {})
-        with self._writing(), self._file:
+        with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._writer.add_metadata(
-                layout.STATISTICS, {topic: json.dumps(account) for topic, account in accounts.items()}
+                layout.STATISTICS, {topic: json.dumps(asdict(account)) for topic, account in accounts.items()}
             )
             self._writer.add_metadata(layout.CLOSE, end)
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+        return accounts
 
     def __enter__(self) -> Self:
         return self
@@ -187,9 +189,12 @@ class RecordingWriter:
         try:
             yield
         except OSError as error:
-            raise self._failure(error) from error
+            raise self._fail(error) from error
 
-    def _failure(self, error: OSError) -> RunError:
+    def _fail(self, error: OSError) -> RunError:
+        """Close the file: what is on it stays readable, while more could only be put behind half a record."""
+        with suppress(OSError):
+            self._file.close()
         return RunError(f"{self.path}: writing failed: {error.strerror}")
 
 

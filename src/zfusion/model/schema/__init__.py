@@ -1,1 +1,66 @@
-"""The pieces that a scenario is written in, and what each of them means to the numerics."""
+"""The pieces that a scenario is written in: what `Scenario` is built from in Python, and what its file holds."""
+
+from zfusion.model.schema.matrices import MomentsSpec, SequenceSpec, TermSpec, TermsSpec
+from zfusion.model.schema.network import (
+    CompleteGraph,
+    EdgesGraph,
+    GridGraph,
+    LineGraph,
+    MatrixGraph,
+    RandomGeometricGraph,
+    RandomRegularGraph,
+    RingGraph,
+    StarGraph,
+)
+from zfusion.model.schema.run import (
+    CsvSource,
+    McapSource,
+    MethodSpec,
+    PythonSource,
+    RecordingSpec,
+    SimulationSource,
+    TimingSpec,
+    TransportSpec,
+    ZenohSource,
+)
+from zfusion.model.schema.system import (
+    CrossSpec,
+    NoiseSpec,
+    PairSpec,
+    SensorSpec,
+    SystemSpec,
+    TapSpec,
+    WhiteSpec,
+)
+
+__all__ = [
+    "CompleteGraph",
+    "CrossSpec",
+    "CsvSource",
+    "EdgesGraph",
+    "GridGraph",
+    "LineGraph",
+    "MatrixGraph",
+    "McapSource",
+    "MethodSpec",
+    "MomentsSpec",
+    "NoiseSpec",
+    "PairSpec",
+    "PythonSource",
+    "RandomGeometricGraph",
+    "RandomRegularGraph",
+    "RecordingSpec",
+    "RingGraph",
+    "SensorSpec",
+    "SequenceSpec",
+    "SimulationSource",
+    "StarGraph",
+    "SystemSpec",
+    "TapSpec",
+    "TermSpec",
+    "TermsSpec",
+    "TimingSpec",
+    "TransportSpec",
+    "WhiteSpec",
+    "ZenohSource",
+]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -23,7 +24,7 @@ from pydantic import (
 from zfusion.errors import Problem, ScenarioError
 from zfusion.model.checks import covariance_matrix
 from zfusion.model.schema.problems import Located, located
-from zfusion.model.types import Array, NodeId
+from zfusion.model.types import NodeId
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 """What things may be called, as their names become segments of key expressions and of file names."""
@@ -77,10 +78,11 @@ class Spec(BaseModel):
     def _read(cls, document: Any, source: str, instance: Self | None = None) -> Self:
         reading = Reading(source)
         try:
-            return cls.__pydantic_validator__.validate_python(document, self_instance=instance, context=reading)
+            piece: Self = cls.__pydantic_validator__.validate_python(document, self_instance=instance, context=reading)
         except ValidationError as error:
             found = list(located(error, document, reading.keys_of))
-        raise ScenarioError(source, cls._all_problems(document, found)) from None
+            raise ScenarioError(source, cls._all_problems(document, found)) from None
+        return piece
 
     @classmethod
     def _all_problems(cls, document: Any, found: list[Located]) -> list[Problem]:  # noqa: ARG003
@@ -125,53 +127,69 @@ def _name(value: str) -> str:
 Name = Annotated[str, AfterValidator(_name)]
 
 
-def _matrix(value: object) -> tuple[tuple[float, ...], ...]:
+Rows = tuple[tuple[float, ...], ...]
+
+A_MATRIX = "expected a number or a matrix as a list of rows of numbers"
+A_VECTOR = "expected a number or a list of numbers"
+A_TABLE = "expected a number, a list of rows, or a table of diagonal, sequence, terms, or mean and covariance"
+
+
+def _matrix(value: Any) -> Rows:
     """A number, rows of numbers, or {diagonal = numbers}, as rows of floats; ValueError if it is neither."""
-    if isinstance(value, Mapping) and set(value) == {"diagonal"}:
-        return _rows(np.diag(_floats(value["diagonal"], 1)))
-    return _rows(_floats([[value]] if _is_number(value) else value, 2))
+    if isinstance(value, Mapping):
+        if set(value) != {"diagonal"}:
+            raise ValueError(A_TABLE)
+        diagonal = _numbers(value["diagonal"], A_VECTOR)
+        size = range(len(diagonal))
+        return tuple(tuple(diagonal[i] if i == j else 0.0 for j in size) for i in size)
+    given = [[value]] if _is_number(value) else _plain_list(value, A_MATRIX)
+    rows = tuple(_numbers(row, A_MATRIX) for row in given)
+    if len({len(row) for row in rows}) > 1:
+        raise ValueError(f"{A_MATRIX}, all equally long")
+    return rows
 
 
-def _vector(value: object) -> tuple[float, ...]:
-    """A number or a list of numbers, as floats."""
-    return tuple(_floats([value] if _is_number(value) else value, 1).tolist())
+def vector(value: Any) -> tuple[float, ...]:
+    """A number or a list of numbers, as floats; ValueError if it is neither."""
+    return _numbers([value] if _is_number(value) else value, A_VECTOR)
+
+
+def _numbers(value: Any, wanted: str) -> tuple[float, ...]:
+    entries = _plain_list(value, wanted)
+    if not all(_is_number(entry) for entry in entries):
+        raise ValueError(wanted)
+    try:
+        numbers = tuple(float(entry) for entry in entries)
+    except OverflowError:  # a whole number beyond all floats
+        numbers = (inf,)
+    if not all(map(isfinite, numbers)):
+        raise ValueError(f"{wanted}, all of them finite")
+    return numbers
+
+
+def _plain_list(value: Any, wanted: str) -> Sequence[Any]:
+    """The list or numpy array `value` as a list, of at least one item."""
+    items = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(items, list | tuple) or not items:
+        raise ValueError(wanted)
+    return items
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
-def _floats(value: Any, dimensions: int) -> Array:
-    """`value` as a non-empty array of finite numbers with so many dimensions."""
-    wanted = "a number or a list of numbers" if dimensions == 1 else "a number or a matrix as a list of rows"
-    entries = value.tolist() if isinstance(value, np.ndarray) else value
-    rows = [entries] if dimensions == 1 else entries
-    if not isinstance(rows, list | tuple) or not all(isinstance(row, list | tuple) for row in rows):
-        raise ValueError(f"expected {wanted}")
-    if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
-        raise ValueError(f"expected {wanted}, not empty and all rows equally long")
-    if not all(_is_number(entry) for row in rows for entry in row):
-        raise ValueError(f"expected {wanted}")
-    array = np.array(entries, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f"expected {wanted}, all of them finite")
-    return array
-
-
-def _rows(array: Array) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, array.tolist()))
-
-
-def shortest(rows: tuple[tuple[float, ...], ...]) -> float | list[list[float]]:
-    return rows[0][0] if len(rows) == len(rows[0]) == 1 else [list(row) for row in rows]
-
-
-def _semidefinite(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+def _semidefinite(rows: Rows) -> Rows:
+    if len(rows) == len(rows[0]) == 1 and rows[0][0] < 0:
+        raise ValueError("expected a variance >= 0")
     covariance_matrix("", rows)
     return rows
 
 
-Rows = tuple[tuple[float, ...], ...]
+def shortest(rows: Rows) -> float | list[list[float]]:
+    """As it is written: a 1 x 1 matrix as a number."""
+    return rows[0][0] if len(rows) == len(rows[0]) == 1 else [list(row) for row in rows]
+
 
 Matrix = Annotated[Rows, PlainValidator(_matrix), PlainSerializer(shortest, return_type=Any)]
 """Rows of numbers; a number stands for a 1 x 1 matrix, {diagonal = [...]} for a diagonal one."""
@@ -185,7 +203,7 @@ Covariance = Annotated[
 
 Vector = Annotated[
     tuple[float, ...],
-    PlainValidator(_vector),
+    PlainValidator(vector),
     PlainSerializer(lambda vector: vector[0] if len(vector) == 1 else list(vector), return_type=Any),
 ]
 """Numbers; a single one may stand without brackets."""
@@ -194,13 +212,15 @@ Vector = Annotated[
 def _plain(value: object) -> object:
     """Refuses what a TOML file could not hold."""
     match value:
-        case bool() | int() | float() | str():
+        case bool() | int() | str():
+            return value
+        case float() if isfinite(value):
             return value
         case list() | tuple():
             return [_plain(item) for item in value]
         case dict() if all(isinstance(key, str) for key in value):
             return {key: _plain(item) for key, item in value.items()}
-    raise ValueError("expected text, numbers, true or false, lists and tables of these")
+    raise ValueError("expected text, finite numbers, true or false, lists and tables of these")
 
 
 Options = Annotated[dict[str, Any], AfterValidator(_plain)]

@@ -14,7 +14,7 @@ from typing import Any
 from zfusion.errors import Problem
 from zfusion.model.checks import ModelError, covariance_matrix
 from zfusion.model.schema.base import shortest
-from zfusion.model.schema.matrices import items_of, shape_problems
+from zfusion.model.schema.matrices import items_of, shape_of, shape_problems
 from zfusion.model.schema.network import Graph
 from zfusion.model.schema.numeric import size_of
 from zfusion.model.schema.problems import NOT_GIVEN, below
@@ -38,8 +38,9 @@ class Parts:
 
     @property
     def nx(self) -> int | None:
-        """Size of the state, if it is known."""
-        return None if self.system is None else size_of(self.system.F)
+        """Size of the state, if it is known: if F is square."""
+        shape = (0, 1) if self.system is None else shape_of(items_of(self.system.F)[0])
+        return shape[0] if shape[0] == shape[1] else None
 
     @property
     def readable_sensors(self) -> list[tuple[str, SensorSpec]]:
@@ -93,9 +94,12 @@ def _id_problems(parts: Parts) -> Iterator[Problem]:
 
 def _system_problems(parts: Parts) -> Iterator[Problem]:
     system, nx = parts.system, parts.nx
-    if system is None or nx is None:
+    if system is None:
         return
-    yield from shape_problems("system.F", system.F, (nx, nx))
+    size = size_of(system.F)
+    yield from shape_problems("system.F", system.F, (size, size))
+    if nx is None:
+        return
     mean = system.initial_mean
     if mean is not None and len(mean) != nx:
         yield Problem("system.initial_mean", list(mean), f"expected {nx} numbers, as F is {nx} x {nx}")
@@ -103,7 +107,9 @@ def _system_problems(parts: Parts) -> Iterator[Problem]:
     if system.Q is not None:
         yield from shape_problems("system.Q", system.Q, (nx, nx))
     elif system.noise is None or parts.by_covariance:
-        yield Problem("system.Q", NOT_GIVEN, "required: the covariance of the process noise, even if it is zero")
+        yield Problem(
+            "system.Q", NOT_GIVEN, "required: the covariance of the process noise, even if it is zero, or else noise"
+        )
     yield from _tap_problems("system.noise", system.noise, nx, parts)
 
 
@@ -117,7 +123,7 @@ def _sensor_problems(place: str, sensor: SensorSpec, parts: Parts) -> Iterator[P
         if elsewhere:
             yield Problem(f"{place}.R", _shown(sensor.R), "expected either this or the whole noise.R, not both")
     elif not elsewhere and (sensor.noise is None or parts.by_covariance) and noise is not None:
-        yield Problem(f"{place}.R", NOT_GIVEN, "required: the covariance of the measurement noise")
+        yield Problem(f"{place}.R", NOT_GIVEN, "required: the covariance of the measurement noise, or else noise")
     yield from _tap_problems(f"{place}.noise", sensor.noise, ny, parts)
     source = sensor.source or parts.source
     if isinstance(source, CsvSource) and len(source.columns) != ny:

@@ -27,7 +27,7 @@ from pydantic import (
 from zfusion.errors import Problem
 from zfusion.model.distributions import Bernoulli, Discrete, Distribution, Exponential, Normal, Uniform
 from zfusion.model.matrices import ByMoments, Fixed, RandomMatrix, Schedule, Terms
-from zfusion.model.schema.base import Covariance, Matrix, Spec, shortest
+from zfusion.model.schema.base import Covariance, Matrix, Spec, shortest, vector
 from zfusion.model.schema.problems import NOT_GIVEN, Faults, unknown_key
 from zfusion.model.types import Array
 
@@ -61,13 +61,26 @@ def _distribution(value: object) -> Distribution:
         wrong = value.get("distribution", NOT_GIVEN)
         raise Faults([Problem("distribution", wrong, f"expected one of {', '.join(LAWS)}")])
     parameters = {key: item for key, item in value.items() if key != "distribution"}
-    known = {parameter.name: parameter.default is MISSING for parameter in fields(law)}  # type: ignore[arg-type]
-    faults = [unknown_key(key, item, known) for key, item in parameters.items() if key not in known]
-    missing = [name for name, required in known.items() if required and name not in parameters]
-    faults += [Problem(name, NOT_GIVEN, "required") for name in missing]
+    faults = list(_parameter_faults(law, parameters))
     if faults:
         raise Faults(faults)
     return law(**parameters)
+
+
+def _parameter_faults(law: type[Distribution], parameters: Mapping[str, Any]) -> Iterator[Problem]:
+    """Parameters that the law does not have, or that it needs, and lists that are not of numbers."""
+    required = {parameter.name: parameter.default is MISSING for parameter in fields(law)}  # type: ignore[arg-type]
+    for key, item in parameters.items():
+        if key not in required:
+            yield unknown_key(key, item, required)
+        elif isinstance(item, list | tuple):
+            try:
+                vector(item)
+            except ValueError as error:
+                yield Problem(key, item, str(error))
+    for key, is_required in required.items():
+        if is_required and key not in parameters:
+            yield Problem(key, NOT_GIVEN, "required")
 
 
 def _written(law: Distribution) -> dict[str, Any]:
@@ -99,7 +112,7 @@ class TermsSpec(Spec):
     """The sum of terms, with independent scalar variables drawn afresh at each step."""
 
     terms: Annotated[tuple[TermSpec, ...], Field(min_length=1)]
-    variables: dict[str, DistributionSpec] = {}
+    variables: dict[str, DistributionSpec] = Field(default_factory=dict)
 
     @cached_property
     def numeric(self) -> RandomMatrix:
@@ -140,42 +153,44 @@ class SequenceSpec(Spec, Generic[T]):
 def _kind_of_random(value: object) -> str:
     keys = set(value) if isinstance(value, Mapping) else set[str]()
     if isinstance(value, SequenceSpec) or "sequence" in keys:
-        return "sequence"
+        return "<sequence>"
     if isinstance(value, TermsSpec) or keys & {"terms", "variables"}:
-        return "terms"
+        return "<terms>"
     if isinstance(value, MomentsSpec) or keys & {"mean", "covariance"}:
-        return "moments"
-    return "matrix"
+        return "<moments>"
+    return "<matrix>"
 
 
 def _kind_of_fixed(value: object) -> str:
     kind = _kind_of_random(value)
-    return kind if kind == "sequence" else "matrix"
+    return kind if kind == "<sequence>" else "<matrix>"
 
 
 AnyMatrix = Annotated[
-    Annotated[Matrix, Tag("matrix")] | Annotated[TermsSpec, Tag("terms")] | Annotated[MomentsSpec, Tag("moments")],
+    Annotated[Matrix, Tag("<matrix>")]
+    | Annotated[TermsSpec, Tag("<terms>")]
+    | Annotated[MomentsSpec, Tag("<moments>")],
     Discriminator(_kind_of_random),
 ]
 """A matrix, random or not."""
 
 RandomOverTime = Annotated[
-    Annotated[Matrix, Tag("matrix")]
-    | Annotated[TermsSpec, Tag("terms")]
-    | Annotated[MomentsSpec, Tag("moments")]
-    | Annotated[SequenceSpec[AnyMatrix], Tag("sequence")],
+    Annotated[Matrix, Tag("<matrix>")]
+    | Annotated[TermsSpec, Tag("<terms>")]
+    | Annotated[MomentsSpec, Tag("<moments>")]
+    | Annotated[SequenceSpec[AnyMatrix], Tag("<sequence>")],
     Discriminator(_kind_of_random),
 ]
 """A matrix, random or not, or a sequence of such."""
 
 MatrixOverTime = Annotated[
-    Annotated[Matrix, Tag("matrix")] | Annotated[SequenceSpec[Matrix], Tag("sequence")],
+    Annotated[Matrix, Tag("<matrix>")] | Annotated[SequenceSpec[Matrix], Tag("<sequence>")],
     Discriminator(_kind_of_fixed),
 ]
 """A matrix or a sequence of matrices."""
 
 CovarianceOverTime = Annotated[
-    Annotated[Covariance, Tag("matrix")] | Annotated[SequenceSpec[Covariance], Tag("sequence")],
+    Annotated[Covariance, Tag("<matrix>")] | Annotated[SequenceSpec[Covariance], Tag("<sequence>")],
     Discriminator(_kind_of_fixed),
 ]
 """A covariance matrix or a sequence of such."""

@@ -164,14 +164,14 @@ def _form(value: object) -> str | None:
     """Which of the three forms of description it is."""
     for form in ("matrix", "edges", "generator"):
         if (isinstance(value, Mapping) and form in value) or hasattr(value, form):
-            return form
+            return f"<{form}>"
     return None
 
 
 AnyGraph = Annotated[
-    Annotated[MatrixGraph, Tag("matrix")]
-    | Annotated[EdgesGraph, Tag("edges")]
-    | Annotated[Generated, Tag("generator")],
+    Annotated[MatrixGraph, Tag("<matrix>")]
+    | Annotated[EdgesGraph, Tag("<edges>")]
+    | Annotated[Generated, Tag("<generator>")],
     Discriminator(
         _form,
         custom_error_type="no_form",

@@ -52,9 +52,10 @@ def _noise(system: SystemSpec, sensors: Mapping[NodeId, SensorSpec], noise: Nois
 def _moving_average(system: SystemSpec, sensors: Mapping[NodeId, SensorSpec], noise: NoiseSpec) -> MovingAverageNoise:
     white = {name: WhiteNoise(np.array(spec.covariance), spec.shape or Normal()) for name, spec in noise.white.items()}
     taps: dict[str, tuple[Tap, ...]] = {}
-    every = [("process", system, system.Q, 0), *((f"sensor/{i}", s, s.R, 1) for i, s in sensors.items())]
-    for name, spec, own, first in every:
-        taps[name] = tuple(_tap(tap, white, first) for tap in spec.noise or ())
+    noises = [("process", system.noise, system.Q, 0)]
+    noises += [(f"sensor/{i}", sensor.noise, sensor.R, 1) for i, sensor in sensors.items()]
+    for name, given, own, first in noises:
+        taps[name] = tuple(_tap(tap, white, first) for tap in given or ())
         if own is not None:
             white[OWN + name], tap = _own_white(OWN + name, own, first)
             taps[name] += (tap,)

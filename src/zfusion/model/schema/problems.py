@@ -21,9 +21,9 @@ WORDS: Mapping[str, str] = {
     "bool_type": "expected true or false",
     "string_type": "expected text",
     "finite_number": "expected a finite number",
-    "greater_than": "expected a number > {gt}",
-    "greater_than_equal": "expected a number >= {ge}",
-    "less_than_equal": "expected a number <= {le}",
+    "greater_than": "expected a number > {gt:g}",
+    "greater_than_equal": "expected a number >= {ge:g}",
+    "less_than_equal": "expected a number <= {le:g}",
     "literal_error": "expected {expected}",
     "tuple_type": "expected a list",
     "dict_type": "expected a table",
@@ -62,8 +62,13 @@ class Faults(ValueError):
 
 def text_of(path: Path) -> str:
     """The path as written in messages: ``sensors[2].H``."""
-    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
-    return text.removeprefix(".")
+    parts = (f"[{key}]" if isinstance(key, int) else f".{_key(key)}" for key in path)
+    return "".join(parts).removeprefix(".")
+
+
+def _key(key: str) -> str:
+    """A key on one line, whatever is in it."""
+    return key if key and key.isprintable() else repr(key)
 
 
 def below(prefix: str, problem: Problem) -> Problem:
@@ -77,7 +82,7 @@ def unknown_key(key: str, value: object, known: Iterable[str]) -> Problem:
     known = sorted(known)
     meant = get_close_matches(key, known, n=1) or [name for name in known if name.lower() == key.lower()]
     hint = f"did you mean {meant[0]!r}?" if meant else f"expected one of {', '.join(known)}"
-    return Problem(key, value, f"unknown key; {hint}")
+    return Problem(text_of((key,)), value, f"unknown key; {hint}")
 
 
 def located(error: ValidationError, document: object, keys_of: Mapping[int, Iterable[str]]) -> Iterator[Located]:
@@ -89,6 +94,8 @@ def located(error: ValidationError, document: object, keys_of: Mapping[int, Iter
         path = _path(document, fault["loc"], keep_last=fault["type"] == "missing")
         value = NOT_GIVEN if fault["type"] == "missing" else fault["input"]
         context = fault.get("ctx", {})
+        if fault["type"] == "too_short" and len(fault["input"]) >= context["min_length"]:
+            continue  # pydantic counts only the items that are right; the others have their own faults
         if fault["type"] == "extra_forbidden":
             known = keys_of.get(id(_at(document, path[:-1])), ())
             problem = unknown_key(str(path[-1]), value, known)
@@ -123,7 +130,7 @@ def _raised(error: ValueError, value: object) -> Iterable[Problem]:
 
 
 def _path(document: object, location: tuple[str | int, ...], keep_last: bool) -> Path:
-    """pydantic's location without the labels of alternatives that it contains but the document does not."""
+    """pydantic's location without what is not in the document: the labels of alternatives, "<sequence>" and such."""
     path: list[str | int] = []
     place = document
     for n, step in enumerate(location):

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, PlainValidator, model_validator
 
 from zfusion.errors import Problem
-from zfusion.model.schema.base import Count, Flag, Id, Natural, Options, Positive, Spec
+from zfusion.model.schema.base import Flag, Id, Number, Options, Positive, Spec
 from zfusion.model.schema.problems import Faults
 from zfusion.model.types import NodeId
 
@@ -28,7 +28,7 @@ class MethodSpec(Spec):
     """The method of estimation and what it takes; which methods there are is the methods' business."""
 
     name: str = "two_stage"
-    options: Options = {}
+    options: Options = Field(default_factory=dict)
 
 
 def _method(value: object) -> object:
@@ -56,7 +56,7 @@ class TimingSpec(Spec):
 
     rate_hz: Positive | None = None
     free_run: Flag = False
-    deadlines: dict[str, Fraction] = {}
+    deadlines: dict[str, Fraction] = Field(default_factory=dict)
     timeout_s: Positive = 5.0
     epoch: Annotated[datetime, PlainValidator(_epoch)] | None = None
 
@@ -139,7 +139,8 @@ class SimulationSource(SourceSpec):
 class CsvSource(SourceSpec):
     """A row for each step, or, with `id_column`, for each step and sensor; an empty cell or no row is no reading.
 
-    "{id}" in the file's and the columns' names stands for the sensor's id.
+    "{id}" in the file's and the columns' names stands for the sensor's id. With `time_column`, step k takes the last
+    row of first_time + (k - 1) time_step <= time < first_time + k time_step.
     """
 
     PATHS = ("file",)
@@ -155,6 +156,21 @@ class CsvSource(SourceSpec):
     """Holds a whole number that grows by one from step to step; without it the rows are steps 1, 2, ..."""
     first_step: Annotated[int, Field(strict=True)] = 1
     """What step_column says at step 1; without step_column, the row (from 1) of step 1."""
+    time_column: str | None = None
+    """Holds a time as a number."""
+    first_time: Number | None = None
+    """When step 1 begins, and how long a step is, in the unit of time_column."""
+    time_step: Positive | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        by_time = {"time_column", "first_time", "time_step"}
+        given = {name for name in by_time if getattr(self, name) is not None}
+        if given and given != by_time:
+            raise ValueError("expected time_column, first_time and time_step together")
+        if given and self.model_fields_set & {"step_column", "first_step"}:
+            raise ValueError("expected either step_column and first_step or time_column and what goes with it")
+        return self
 
 
 class McapSource(SourceSpec):
@@ -186,7 +202,7 @@ class PythonSource(SourceSpec):
 
     kind: Literal["python"] = "python"
     function: Annotated[str, AfterValidator(_callable)]
-    options: Options = {}
+    options: Options = Field(default_factory=dict)
 
     def with_paths(self, changed: Callable[[str], str]) -> Self:
         """See `Spec`; a module's name is no path."""
@@ -226,7 +242,7 @@ class TransportSpec(Spec):
 
     PATHS = ("zenoh_config",)
 
-    endpoints: Endpoints = {}
+    endpoints: Endpoints = Field(default_factory=dict)
     base_port: Annotated[int, Field(strict=True, ge=1, le=65535)] = 7450
     """Nodes without an endpoint listen on 127.0.0.1 at base_port plus their place among the sorted ids."""
     mesh: Literal["neighbours", "full"] = "neighbours"

@@ -103,15 +103,15 @@ def is_by_parts(covariance: object) -> bool:
 
 
 def _form(covariance: object) -> str:
-    return "parts" if is_by_parts(covariance) else "whole"
+    return "<parts>" if is_by_parts(covariance) else "<whole>"
 
 
 ByPair = Annotated[
-    Annotated[MatrixOverTime, Tag("whole")] | Annotated[tuple[PairSpec, ...], Tag("parts")],
+    Annotated[MatrixOverTime, Tag("<whole>")] | Annotated[tuple[PairSpec, ...], Tag("<parts>")],
     Discriminator(_form),
 ]
 BySensor = Annotated[
-    Annotated[MatrixOverTime, Tag("whole")] | Annotated[tuple[CrossSpec, ...], Tag("parts")],
+    Annotated[MatrixOverTime, Tag("<whole>")] | Annotated[tuple[CrossSpec, ...], Tag("<parts>")],
     Discriminator(_form),
 ]
 
@@ -123,7 +123,7 @@ class NoiseSpec(Spec):
     S2 = Cov[w_k, V_{k+2}], with V the stack of all v^i, each as a whole matrix or by its non-zero blocks.
     """
 
-    white: dict[Name, WhiteSpec] = {}
+    white: dict[Name, WhiteSpec] = Field(default_factory=dict)
     Q1: MatrixOverTime | None = None
     R: ByPair | None = None
     R1: ByPair | None = None

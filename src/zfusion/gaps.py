@@ -121,6 +121,11 @@ class GapCounter:
         """A message came that has no legal counters."""
         self._unreadable += 1
 
+    @property
+    def heard(self) -> int:
+        """One more than the highest number that came in the present life."""
+        return self._life.next
+
     def gaps(self, sent: Mapping[int, int] | None = None) -> Gaps:
         """The account so far; `sent` tells how many messages the sender had put on the key, by its lives' `born`."""
         sent = sent or {}

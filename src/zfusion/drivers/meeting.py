@@ -1,0 +1,156 @@
+"""How the nodes of a swarm agree on when to begin, with nobody in charge.
+
+A node is *ready* when it has found all that it is linked to, and the recorder where there is to be one. Every node
+keeps asking its neighbours who is known to be ready; when everybody is, the node with the smallest id names the
+epoch, which spreads the same way. A node that finds the others running joins them.
+
+No input or output: it is told who is there and what they answered, and says when and with which step to begin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from zfusion.errors import InputError
+from zfusion.model.types import NodeId
+from zfusion.status import Phase, Status
+
+POLL_NS = 50_000_000
+"""How often neighbours are asked. The epoch spreads one link per poll."""
+
+LEAD_NS = 100_000_000
+"""From naming the epoch to the epoch, beside the time that it takes to spread."""
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """When and with what a node begins."""
+
+    born: int
+    epoch_ns: int
+    """When step 0 was, for paced swarms: step k begins at epoch + k period."""
+    expected: frozenset[NodeId]
+    """The in-neighbours to wait for from the first step on."""
+
+
+@dataclass(slots=True)
+class Meeting:
+    """One node's view of who is there."""
+
+    own: NodeId
+    identity: tuple[str, int, str]
+    started_ns: int
+    """When this process was started: tells its lives apart."""
+    hears: frozenset[NodeId]
+    """In-neighbours."""
+    linked: frozenset[NodeId]
+    """All it has links to."""
+    swarm: frozenset[NodeId]
+    """All that it is connected with over any number of links."""
+    hops: int
+    """Links from the smallest of them to the farthest."""
+    needs_recorder: bool
+    period_ns: int | None
+    epoch_ns: int | None = None
+    fixed_epoch: bool = False
+    """The epoch was given: it is kept to, whoever is there by then."""
+    present: set[NodeId] = field(default_factory=set)
+    recorder: bool = False
+    ready: dict[NodeId, int] = field(default_factory=dict)
+    heard: dict[NodeId, Status] = field(default_factory=dict)
+
+    def came(self, node: NodeId) -> None:
+        """A linked node is there."""
+        self.present.add(node)
+
+    def went(self, node: NodeId) -> None:
+        """A linked node is gone."""
+        self.present.discard(node)
+        self.heard.pop(node, None)
+
+    def answered(self, status: Status) -> None:
+        """What a linked node answered; InputError if it runs something else than this node."""
+        check_identity(self.own, self.identity, status)
+        self.heard[status.node] = status
+        for node, started in status.ready.items():
+            if node in self.swarm and node != self.own:
+                self.ready[node] = max(started, self.ready.get(node, 0))
+        if status.epoch_ns is not None and not self.fixed_epoch:
+            self.epoch_ns = status.epoch_ns
+
+    def missing(self) -> list[str]:
+        """Who or what this node still waits for, in words."""
+        absent = [f"node {j}" for j in sorted(self.linked - self.present, key=str)]
+        absent += ["the recorder"] if self.needs_recorder and not self.recorder else []
+        return absent or [f"node {j} to be ready" for j in sorted(self.swarm - self.ready.keys(), key=str)]
+
+    def start(self, now: int) -> Start | None:
+        """When to begin, if that can be said yet."""
+        if self.needs_recorder and not self.recorder:
+            return None
+        if joined := self._join_running(now):
+            return joined
+        if self.linked <= self.heard.keys() and self.linked <= self.present:
+            self.ready[self.own] = self.started_ns
+        if self.swarm <= self.ready.keys():
+            if self.epoch_ns is None and self.own == min(self.swarm):
+                lead = 0 if self.period_ns is None else LEAD_NS + 2 * self.hops * POLL_NS - self.period_ns
+                self.epoch_ns = now + lead
+            if self.epoch_ns is not None:
+                return Start(1, self.epoch_ns, self.hears)
+        return self._start_without_the_rest(now)
+
+    def _join_running(self, now: int) -> Start | None:
+        """Begin among nodes that are running already and do not know of this process."""
+        running = [
+            s for s in self.heard.values() if s.phase is Phase.RUNNING and s.ready.get(self.own) != self.started_ns
+        ]
+        if not running or not self.present <= self.heard.keys():
+            return None
+        epoch = self.epoch_ns if self.epoch_ns is not None else now
+        born = max(s.step for s in running) + 1
+        if self.period_ns is not None:
+            born = max(1, (now - epoch) // self.period_ns + 1)
+        return Start(born, epoch, self.hears & {s.node for s in running})
+
+    def _start_without_the_rest(self, now: int) -> Start | None:
+        """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there."""
+        if not self.fixed_epoch or self.epoch_ns is None or self.period_ns is None:
+            return None
+        if now < self.epoch_ns + self.period_ns:
+            return None
+        return Start((now - self.epoch_ns) // self.period_ns + 1, self.epoch_ns, self.hears & self.heard.keys())
+
+
+def check_identity(own: NodeId, identity: tuple[str, int, str], status: Status) -> None:
+    """InputError, with both sides, unless a neighbour runs the same scenario on the same version."""
+    if status.identity != identity:
+        mine, theirs = (f"scenario {i[2][:12]} on zfusion {i[0]}, wire format {i[1]}" for i in (identity, status.identity))
+        raise InputError(f"node {status.node} runs {theirs}; this node, {own}, runs {mine}: they cannot be of one swarm")
+
+
+def hops_from_smallest(swarm: Collection[NodeId], links: Collection[tuple[NodeId, NodeId]]) -> int:
+    """Links from the smallest of the connected `swarm` to the node farthest from it."""
+    beside: dict[NodeId, set[NodeId]] = {node: set() for node in swarm}
+    for a, b in links:
+        if a in beside and b in beside:
+            beside[a].add(b)
+            beside[b].add(a)
+    reached, edge, hops = {min(swarm)}, {min(swarm)}, 0
+    while edge := {b for a in edge for b in beside[a]} - reached:
+        reached |= edge
+        hops += 1
+    return hops
+
+
+def connected(node: NodeId, links: Collection[tuple[NodeId, NodeId]]) -> frozenset[NodeId]:
+    """All nodes that `node` is connected with over links, itself included."""
+    beside: dict[NodeId, set[NodeId]] = {}
+    for a, b in links:
+        beside.setdefault(a, set()).add(b)
+        beside.setdefault(b, set()).add(a)
+    reached, edge = {node}, {node}
+    while edge := {b for a in edge for b in beside.get(a, ())} - reached:
+        reached |= edge
+    return frozenset(reached)

@@ -1,0 +1,224 @@
+"""The summary of a run: what arrived, what did not, and how far off the estimates were."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from zfusion.drivers.metrics import Latencies, NodeReport
+from zfusion.drivers.recorder import RecorderReport
+from zfusion.model.scenario import Scenario
+from zfusion.model.types import NodeId
+from zfusion.stages import ESTIMATE
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """What became of one stage's messages on one edge, from the two ends' own counters."""
+
+    sender: str
+    receiver: str
+    stage: str
+    sent: int
+    received: int
+    late: int
+    lost: int
+    missed: int
+    """Not there at the deadline, whatever the reason."""
+    recorded: int | None
+
+
+def summarize(
+    run: str,
+    scenario: Scenario,
+    reports: Mapping[NodeId, Sequence[NodeReport]],
+    recorder: RecorderReport | None,
+    *,
+    failures: Sequence[str] = (),
+    interrupted: bool = False,
+    logs: str | None = None,
+) -> dict[str, Any]:
+    """The summary as plain data: what ``--json`` prints.
+
+    run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
+    rounds_per_s, latency_us {p50, p99} from measurement to estimate, rmse {stage: {node}} where the truth is known,
+    predicted_rmse {stage: {node}}, recording; and the verdict on each edge.
+    """
+    lives = [report for of_node in reports.values() for report in of_node]
+    sent: Counter[str] = Counter()
+    for report in lives:
+        sent.update(report.sent)
+    edges = list(_edges(reports, recorder))
+    latencies = Latencies()
+    for report in lives:
+        latencies.merge({int(number): count for number, count in report.latency.items()})
+    return {
+        "run": run,
+        "method": scenario.method.name,
+        "nodes": list(scenario.ids),
+        "steps": scenario.steps,
+        "completed_steps": {str(i): sum(r.completed for r in reports.get(i, ())) for i in scenario.ids},
+        "messages": {"sent": dict(sent), "recorded": dict(recorder.recorded) if recorder else {}},
+        "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
+        "late": sum(edge.late for edge in edges),
+        "missed": sum(edge.missed for edge in edges),
+        "refused": _refused(lives),
+        "fallbacks": sum(report.fallbacks for report in lives),
+        "skipped": sum(report.skipped for report in lives),
+        "rounds_per_s": _rate(lives),
+        "latency_us": {"p50": latencies.quantile_us(0.5), "p99": latencies.quantile_us(0.99)},
+        "rmse": _by_stage(reports, "mse"),
+        "predicted_rmse": _by_stage(reports, "predicted_mse"),
+        "nees": _nees(reports),
+        "recording": recorder.path if recorder else None,
+        "lost_on_recording": dict(recorder.lost) if recorder else {},
+        "edges": [asdict(edge) for edge in edges],
+        "interrupted": interrupted,
+        "failures": list(failures),
+        "logs": logs,
+    }
+
+
+def _edges(reports: Mapping[NodeId, Sequence[NodeReport]], recorder: RecorderReport | None) -> Iterable[Edge]:
+    """The verdict on every edge and stage, over all lives whose ends were told."""
+    by_text = {str(i): lives for i, lives in reports.items()}
+    for receiver, lives in by_text.items():
+        for sender in dict.fromkeys(j for report in lives for j in report.edges):
+            told = [report.edges[sender] for report in lives if sender in report.edges]
+            senders_lives = by_text.get(sender, ())
+            for stage in dict.fromkeys(s for edge in told for s in edge["heard"]):
+                count = {kind: sum(edge[kind].get(stage, 0) for edge in told) for kind in ("received", "late", "missed", "lost")}
+                count["lost"] += _lost_at_the_end(stage, lives, senders_lives, sender)
+                yield Edge(
+                    sender,
+                    receiver,
+                    stage,
+                    sent=sum(report.sent.get(stage, 0) for report in senders_lives),
+                    recorded=None if recorder is None else recorder.by_key.get(f"{sender}/{stage}", 0),
+                    **count,
+                )
+
+
+def _lost_at_the_end(
+    stage: str, lives: Sequence[NodeReport], senders_lives: Sequence[NodeReport], sender: str
+) -> int:
+    """What the sender put on its key after the last message that came, less what is of steps the receiver never took.
+
+    Known only where both lived once: of a life that was cut short nobody told the totals.
+    """
+    if len(lives) != 1 or len(senders_lives) != 1:
+        return 0
+    [receiver], [told] = lives, senders_lives
+    unread = max(0, told.step - receiver.step)
+    return max(0, told.sent.get(stage, 0) - receiver.edges[sender]["heard"].get(stage, 0) - unread)
+
+
+def _refused(lives: Iterable[NodeReport]) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for report in lives:
+        total.update(report.overheard)
+        for edge in report.edges.values():
+            total.update(edge["refused"])
+    return dict(total)
+
+
+def _rate(lives: Sequence[NodeReport]) -> float | None:
+    """Steps a second of the slowest node that took any."""
+    rates = [report.completed / report.elapsed_s for report in lives if report.completed and report.elapsed_s > 0]
+    return round(min(rates), 2) if rates else None
+
+
+def _by_stage(reports: Mapping[NodeId, Sequence[NodeReport]], squared: str) -> dict[str, dict[str, float]]:
+    """Stage -> node -> root of the mean over all lives of a mean squared error."""
+    found: dict[str, dict[str, float]] = {}
+    for node, lives in reports.items():
+        for stage in dict.fromkeys(s for report in lives for s in report.errors):
+            told = [report.errors[stage] for report in lives if squared in report.errors.get(stage, {})]
+            count = sum(errors["count"] for errors in told)
+            if count:
+                mean = sum(errors[squared] * errors["count"] for errors in told) / count
+                found.setdefault(stage, {})[str(node)] = math.sqrt(mean)
+    return found
+
+
+def _nees(reports: Mapping[NodeId, Sequence[NodeReport]]) -> dict[str, float]:
+    """Node -> mean normalised squared error of its estimates; near nx where its covariances can be believed."""
+    found = {}
+    for node, lives in reports.items():
+        told = [report.errors[ESTIMATE.name] for report in lives if "nees" in report.errors.get(ESTIMATE.name, {})]
+        count = sum(errors["count"] for errors in told)
+        if count:
+            found[str(node)] = sum(errors["nees"] * errors["count"] for errors in told) / count
+    return found
+
+
+def show_summary(console: Console, summary: Mapping[str, Any]) -> None:
+    """The summary for people."""
+    table = Table(title=f"{summary['run']}   {summary['method']}", title_justify="left")
+    stages = list(summary["rmse"])
+    headings = ["node", "steps", *(f"rmse {stage}" for stage in stages)]
+    headings += ["predicted", "nees"] if summary["predicted_rmse"] else []
+    for name in headings:
+        table.add_column(name, justify="left" if name == "node" else "right")
+    predicted = summary["predicted_rmse"].get(ESTIMATE.name, {})
+    for node in map(str, summary["nodes"]):
+        cells = [node, str(summary["completed_steps"][node])]
+        cells += [_number(summary["rmse"][stage].get(node)) for stage in stages]
+        if summary["predicted_rmse"]:
+            cells += [_number(predicted.get(node)), _number(summary["nees"].get(node))]
+        table.add_row(*cells)
+    console.print(table)
+    _show_traffic(console, summary)
+    for failure in summary["failures"]:
+        console.print(f"[bold red]failed:[/] {escape(failure)}")
+    if summary["recording"]:
+        console.print(f"recording: {summary['recording']}", soft_wrap=True)
+    if summary["logs"] and summary["failures"]:
+        console.print(f"logs: {summary['logs']}", soft_wrap=True)
+
+
+def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
+    sent, recorded = summary["messages"]["sent"], summary["messages"]["recorded"]
+    counts = ", ".join(f"{count} {stage}" for stage, count in sent.items())
+    console.print(f"sent: {counts}")
+    if recorded:
+        missing = sum(summary["lost_on_recording"].values())
+        console.print(f"recorded: {sum(recorded.values())} messages, {missing} missing")
+    trouble = {name: summary[name] for name in ("lost", "late", "missed", "fallbacks", "skipped")}
+    console.print(", ".join(f"{count} {name}" for name, count in trouble.items()))
+    if summary["refused"]:
+        console.print("refused: " + ", ".join(f"{count} {reason}" for reason, count in summary["refused"].items()))
+    latency = summary["latency_us"]
+    if summary["rounds_per_s"] and latency["p50"] is not None:
+        console.print(
+            f"{summary['rounds_per_s']:.1f} steps/s; measurement to estimate "
+            f"{latency['p50']:.0f} µs (p50), {latency['p99']:.0f} µs (p99)"
+        )
+    holes = [edge for edge in summary["edges"] if edge["lost"] or edge["late"] or edge["missed"]]
+    if holes:
+        table = Table(title="edges where something did not arrive in time", title_justify="left")
+        for name in ("edge", "stage", "sent", "received", "late", "lost", "missed"):
+            table.add_column(name, justify="left" if name in {"edge", "stage"} else "right")
+        for edge in holes:
+            numbers = [str(edge[name]) for name in ("sent", "received", "late", "lost", "missed")]
+            table.add_row(f"{edge['sender']} → {edge['receiver']}", edge["stage"], *numbers)
+        console.print(table)
+
+
+def show_node_report(console: Console, report: Mapping[str, Any]) -> None:
+    """How one node went, for people."""
+    console.print(f"node {report['node']}: {report['completed']} steps in {report['elapsed_s']:.1f} s")
+    for stage, errors in report["errors"].items():
+        if "rmse" in errors:
+            console.print(f"  rmse {stage}: {_number(errors['rmse'])}")
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.5g}"

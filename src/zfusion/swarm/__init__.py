@@ -1,0 +1,1 @@
+"""Swarms of processes: starting them, watching them, and leaving nothing behind."""

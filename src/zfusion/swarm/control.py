@@ -1,0 +1,97 @@
+"""The line between a launcher and the processes that it started: JSON, a line a message, over a socket pair.
+
+    child -> launcher    {"status": {...}}  {"report": {...}}  {"error": "...", "exit_code": 2}
+    launcher -> child    stop
+
+When the launcher is gone, however it went, the child reads the end of the line and stops.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+STOP = b"stop\n"
+
+MAX_LINE = 1 << 20
+"""Longest message from a child: the report of a node with thousands of neighbours."""
+
+_PR_SET_PDEATHSIG = 1
+
+
+class ChildEnd:
+    """A child's end of the line."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._socket = socket.socket(fileno=descriptor)
+        self._lock = threading.Lock()
+
+    def tell(self, **message: object) -> None:
+        """Send a message; nothing happens where the launcher is gone."""
+        with self._lock:
+            try:
+                self._socket.sendall(json.dumps(message).encode() + b"\n")
+            except OSError:
+                return
+
+    def on_stop(self, stop: Callable[[], None]) -> None:
+        """Have `stop` called, from another thread, when the launcher says so or is gone."""
+        threading.Thread(target=self._listen, args=(stop,), name="control", daemon=True).start()
+
+    def _listen(self, stop: Callable[[], None]) -> None:
+        try:
+            self._socket.recv(len(STOP))
+        except OSError:
+            pass  # gone: the same as the end of the line
+        stop()
+
+
+class LauncherEnd:
+    """The launcher's end of the line to one child."""
+
+    def __init__(self) -> None:
+        """Makes the pair; `child` is to be passed on and then closed here."""
+        self.socket, self.child = socket.socketpair()
+        self._received = b""
+
+    def stop(self) -> None:
+        """Ask the child to stop."""
+        try:
+            self.socket.sendall(STOP)
+        except OSError:
+            return  # it is gone already
+
+    def messages(self) -> Iterator[Mapping[str, Any]]:
+        """What the child has said since the last call, without waiting."""
+        while True:
+            try:
+                data = self.socket.recv(65536, socket.MSG_DONTWAIT)
+            except (BlockingIOError, ConnectionError):
+                break
+            if not data:
+                break
+            self._received += data
+        *lines, self._received = self._received.split(b"\n")
+        if len(self._received) > MAX_LINE:
+            self._received = b""
+        for line in lines:
+            yield json.loads(line)
+
+    def close(self) -> None:
+        """Close this end."""
+        self.socket.close()
+
+
+def die_with_parent() -> None:
+    """Have the kernel kill this process when the one that started it dies (Linux; elsewhere the line's end must do).
+
+    For processes that may be stopped or stuck when that happens, and have nothing to save.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
