@@ -33,7 +33,7 @@ class Seeds:
 
     def generator(self, *purpose: str, block: int = 0) -> np.random.Generator:
         """The generator of a purpose for a block of steps, at its beginning."""
-        digest = sha256(repr((purpose, block)).encode()).digest()
+        digest = sha256(repr((purpose, block)).encode()).digest()[:16]
         key = np.frombuffer(digest, dtype="<u4").tolist()
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=key)))
 

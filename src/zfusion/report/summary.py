@@ -55,7 +55,7 @@ def summarize(
     sent: Counter[str] = Counter()
     for report in lives:
         sent.update(report.sent)
-    edges = list(_edges(reports, recorder))
+    edges = list(_edges(reports, recorder, to_the_end=not interrupted))
     latencies = Latencies()
     for report in lives:
         latencies.merge({int(number): count for number, count in report.latency.items()})
@@ -86,8 +86,13 @@ def summarize(
     }
 
 
-def _edges(reports: Mapping[NodeId, Sequence[NodeReport]], recorder: RecorderReport | None) -> Iterable[Edge]:
-    """The verdict on every edge and stage, over all lives whose ends were told."""
+def _edges(
+    reports: Mapping[NodeId, Sequence[NodeReport]], recorder: RecorderReport | None, *, to_the_end: bool
+) -> Iterable[Edge]:
+    """The verdict on every edge and stage, over all lives whose ends were told.
+
+    Only in a run that went to its end (`to_the_end`) were the last messages on every edge waited for.
+    """
     by_text = {str(i): lives for i, lives in reports.items()}
     for receiver, lives in by_text.items():
         for sender in dict.fromkeys(j for report in lives for j in report.edges):
@@ -95,7 +100,8 @@ def _edges(reports: Mapping[NodeId, Sequence[NodeReport]], recorder: RecorderRep
             senders_lives = by_text.get(sender, ())
             for stage in dict.fromkeys(s for edge in told for s in edge["heard"]):
                 count = {kind: sum(edge[kind].get(stage, 0) for edge in told) for kind in ("received", "late", "missed", "lost")}
-                count["lost"] += _lost_at_the_end(stage, lives, senders_lives, sender)
+                if to_the_end:
+                    count["lost"] += _lost_at_the_end(stage, lives, senders_lives, sender)
                 yield Edge(
                     sender,
                     receiver,
@@ -161,7 +167,8 @@ def _nees(reports: Mapping[NodeId, Sequence[NodeReport]]) -> dict[str, float]:
 
 def show_summary(console: Console, summary: Mapping[str, Any]) -> None:
     """The summary for people."""
-    table = Table(title=f"{summary['run']}   {summary['method']}", title_justify="left")
+    console.print(f"[bold]{summary['run']}[/]   {summary['method']}")
+    table = Table()
     stages = list(summary["rmse"])
     headings = ["node", "steps", *(f"rmse {stage}" for stage in stages)]
     headings += ["predicted", "nees"] if summary["predicted_rmse"] else []
@@ -203,7 +210,8 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
         )
     holes = [edge for edge in summary["edges"] if edge["lost"] or edge["late"] or edge["missed"]]
     if holes:
-        table = Table(title="edges where something did not arrive in time", title_justify="left")
+        console.print("edges where something did not arrive in time:")
+        table = Table()
         for name in ("edge", "stage", "sent", "received", "late", "lost", "missed"):
             table.add_column(name, justify="left" if name in {"edge", "stage"} else "right")
         for edge in holes:
