@@ -215,6 +215,54 @@ def record(
     _finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
 
 
+@app.command()
+def design(
+    scenario: ScenarioFile,
+    steps: Steps = None,
+    as_json: Json = False,
+) -> None:
+    """Predict the error covariances of all estimates, without running anything."""
+    from zfusion.methods.prediction import predict  # noqa: PLC0415
+    from zfusion.report.design import as_json_object, show_prediction  # noqa: PLC0415
+
+    loaded = load_scenario(scenario, steps=steps)
+    prediction = predict(loaded.system(), loaded.network, loaded.steps)
+    _finish(as_json_object(prediction), as_json, lambda: show_prediction(out, loaded.name, prediction))
+
+
+@app.command()
+def info(recording: RecordingFile, as_json: Json = False) -> None:
+    """Tell what is on a recording, what is missing and what made it."""
+    from zfusion.recording import Recording  # noqa: PLC0415
+    from zfusion.recording.info import info as information  # noqa: PLC0415
+    from zfusion.report.recording import show_info  # noqa: PLC0415
+
+    with Recording.open(recording) as opened:
+        told = information(opened)
+    _finish(told.as_dict(), as_json, lambda: show_info(out, told))
+
+
+@app.command()
+def export(
+    recording: RecordingFile,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write.", show_default="beside the recording")
+    ] = None,
+    format: Annotated[str, typer.Option("--format", "-f", help="csv, jsonl or npz.")] = "csv",
+    topic: Annotated[list[str] | None, typer.Option(help="Only this topic; may be repeated.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a recording's numbers for other tools."""
+    from zfusion.recording import Recording  # noqa: PLC0415
+    from zfusion.recording.export import export as write  # noqa: PLC0415
+
+    target = output or recording.with_suffix(f".{format}")
+    with Recording.open(recording) as opened:
+        done = write(opened, target, format, topics=topic)
+    result = {"output": str(target), **asdict(done)}
+    _finish(result, as_json, lambda: out.print(f"{done.messages} messages in {target}", soft_wrap=True))
+
+
 def _load(
     path: Path, steps: int | None, rate: float | None, free_run: bool, seed: int | None, method: str | None
 ) -> Scenario:

@@ -2,6 +2,7 @@
 
     ZfusionError
     ├── InputError           what the user gave is wrong; nothing was started            (exit code 2)
+    │   ├── ModelError       a number of the model that cannot be (`model.checks`)
     │   ├── ScenarioError    a scenario file or object: names file, field, value, expectation
     │   └── RecordingError   a recording that is missing, damaged or of another version
     ├── RunError             what was started failed                                     (exit code 1)

@@ -118,6 +118,8 @@ def spectral_floor(G0: Array, G1: Array) -> float:
         eigenvalues: Array = np.linalg.eigvalsh((G0[at] + G1[at] * turn + G1[at].T / turn) / scale)
         return eigenvalues[:, 0]
 
+    if not G1.any():
+        return float(floor(np.zeros(1))[0])
     theta = np.linspace(0, np.pi, FREQUENCIES)
     width = theta[1]
     lowest = floor(theta)

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import product
 from math import inf, sqrt
 
 import numpy as np
@@ -74,6 +75,8 @@ class Tap:
 
 
 Taps = tuple[Tap, ...]
+ByLag = dict[int, list[tuple[str, Tap]]]
+"""The taps of one white noise by their lags, each with the name of its target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,28 +197,24 @@ class MovingAverageNoise(NoiseModel):
                     )
 
     def _outside_structure(self) -> dict[tuple[str, str, int], list[tuple[Tap, Tap]]]:
-        """Pairs of taps that correlate their targets too far apart, by the two targets and how far: (w, v, d) for
-        Cov[w_k, v_{k+d}].
+        """Pairs of taps that correlate their targets too far apart, by (first, second, d) for first_k and second_{k+d}.
 
         Taps of one white noise correlate their targets lag - lag' steps apart. Lags are compared first: a common
         noise has few of them and thousands of targets.
         """
+        w: dict[str, ByLag] = {source: defaultdict(list) for source in self.white}
+        v: dict[str, ByLag] = {source: defaultdict(list) for source in self.white}
+        for tap in self.process:
+            w[tap.source][tap.lag].append(("w", tap))
+        for i, taps in self.sensors.items():
+            for tap in taps:
+                v[tap.source][tap.lag].append((f"v^{i}", tap))
         outside: dict[tuple[str, str, int], list[tuple[Tap, Tap]]] = defaultdict(list)
         for source in self.white:
-            w: dict[int, list[tuple[str, Tap]]] = defaultdict(list)
-            v: dict[int, list[tuple[str, Tap]]] = defaultdict(list)
-            for tap in self.process:
-                if tap.source == source:
-                    w[tap.lag].append(("w", tap))
-            for i, taps in self.sensors.items():
-                for tap in taps:
-                    if tap.source == source:
-                        v[tap.lag].append((f"v^{i}", tap))
             for left, right, nearest, farthest in ((w, w, -inf, 1), (v, v, -inf, 1), (w, v, 0, 2)):
-                too_far = [(a, b) for a in left for b in right if not nearest <= a - b <= farthest]
-                for a, b in too_far:
-                    for one, tap in left[a]:
-                        for other, second in right[b]:
+                for a, b in product(left[source], right[source]):
+                    if not nearest <= a - b <= farthest:
+                        for (one, tap), (other, second) in product(left[source][a], right[source][b]):
                             outside[one, other, a - b].append((tap, second))
         return outside
 
