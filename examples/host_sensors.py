@@ -5,6 +5,8 @@ more. All but `queue` are counters, of which the change since the last call coun
 nor has one for which the machine lacks the file (pressure needs a kernel with PSI, a container may hide its disks).
 """
 
+# ruff: noqa: ARG001 - all are called alike, and none of these needs to know the step, the time and the sensor's name
+
 from __future__ import annotations
 
 import os
@@ -36,7 +38,9 @@ class Rates:
         return [(new - old) / (now - before[0]) for new, old in zip(counters, before[1], strict=True)]
 
 
-rates = Rates()  # each sensor has the variables of this file to itself
+# Each sensor has the variables of this file to itself.
+rates = Rates()
+load: float | None = None
 
 
 def busy(step: int, t_ns: int, node: str) -> float | None:
@@ -61,9 +65,6 @@ def queue(step: int, t_ns: int, node: str) -> float | None:
         return None
     tasks = (load - LOAD_DECAY * before) / (1 - LOAD_DECAY)
     return min(max(tasks / CPUS, 0.0), 1.0)
-
-
-load: float | None = None
 
 
 def pressure(step: int, t_ns: int, node: str) -> float | None:

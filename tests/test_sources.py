@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 
 from zfusion.drivers.callables import NOT_FINITE, as_measurement
 from zfusion.drivers.sources import open_source, open_sources
@@ -28,7 +29,7 @@ def scenario_of(source, directory: Path, ny: int = 1, **changes) -> Scenario:
         "source": source,
         **changes,
     }
-    return Scenario._from_document(document, "test", directory)
+    return Scenario.from_toml(tomli_w.dumps(document), directory=directory)
 
 
 def readings(source, steps) -> list:
@@ -187,7 +188,7 @@ class TestMcap:
 
     def test_a_recording_without_the_sensor_or_of_another_kind_of_sensor_is_refused(self, tmp_path):
         record = self.record(tmp_path / "a.mcap", [self.measured(2, 1, [1, 2])])
-        with pytest.raises(InputError, match=r"a\.mcap: has no measurements of sensor 1, but of 2"):
+        with pytest.raises(InputError, match=r"a\.mcap: has no measurements of sensor 1: there is no topic zfusion/r/"):
             open_source(scenario_of(record, tmp_path), 1)
         with pytest.raises(InputError, match=r"can be a measurement of sensor 2: wrong_shape"):
             open_source(scenario_of(record, tmp_path), 2)

@@ -15,6 +15,7 @@ one kind of error, MessageError, whose `reason` is one of `Reason`. Sizes are bo
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from math import isfinite, prod
@@ -70,6 +71,8 @@ class Reason(StrEnum):
     """More bytes, runs or characters than the sender's messages can have."""
     NOT_MSGPACK = "not_msgpack"
     """Not one msgpack value: cut off, followed by something, or holding what no message holds."""
+    NOT_JSON = "not_json"
+    """A reading that is not JSON text."""
     NOT_A_MAP = "not_a_map"
     VERSION = "version"
     """Of a version of the format that this zfusion does not read."""
@@ -215,6 +218,22 @@ def json_schema(stage: Stage) -> dict[str, object]:
         "properties": properties,
         "required": list(properties),
     }
+
+
+def decode_reading(data: bytes, packed: bool, ny: int) -> Array:
+    """A sensor program's reading, (ny,): a number or a list of numbers, in msgpack if `packed`, else in JSON.
+
+    MessageError if it is anything else.
+    """
+    if len(data) > EXTRA_BYTES + ny * 4 * _NUMBER_BYTES:
+        raise MessageError(Reason.TOO_LARGE, f"{len(data)} bytes")
+    try:
+        value = _unpackb(data) if packed else json.loads(data)
+        values = [float(v) if type(v) is int else v for v in (value if type(value) is list else [value])]
+    except (ValueError, RecursionError, OverflowError, msgpack.UnpackException) as error:
+        raise MessageError(Reason.NOT_MSGPACK if packed else Reason.NOT_JSON, str(error)) from None
+    reading: Array = _vector("reading", (ny,), frozenset())(values, {})  # type: ignore[assignment]
+    return reading
 
 
 _NUMBERS: dict[str, object] = {"type": "array", "items": {"type": "number"}}

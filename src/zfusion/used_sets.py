@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from zfusion.model.statistics import NodeId
+from zfusion.model.types import NodeId
 
 UsedSet = tuple[NodeId, ...]
 Run = tuple[int, UsedSet]

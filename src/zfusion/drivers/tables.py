@@ -63,18 +63,15 @@ def recorded_measurements(path: str, node: NodeId, ny: int, nx: int) -> tuple[By
     is no recording, InputError for one that has nothing of this sensor, or nothing that this sensor could measure.
     """
     with Recording.open(path) as recording:
-        found = {key: topic for topic in recording.topics if (key := _key(topic)) is not None}
-        topic = next((t for key, t in found.items() if (key.node, key.stage) == (str(node), MEASUREMENT.name)), None)
-        if topic is None:
-            others = ", ".join(str(key.node) for key in found if key.stage == MEASUREMENT.name) or "nobody"
-            raise InputError(f"{path}: has no measurements of sensor {node}, but of {others}")
+        run = recording.metadata["run"]
+        topic = keys.stage_key(run, node, MEASUREMENT.name)
+        if topic not in recording.topics:
+            raise InputError(f"{path}: has no measurements of sensor {node}: there is no topic {topic}")
         measurements, refusals = _decoded(recording, topic, Decoder(MEASUREMENT, node, sizes={"ny": ny}), "y")
         if refusals and not measurements:
             raise InputError(f"{path}: nothing on {topic} can be a measurement of sensor {node}: {refusals[0]}")
-        truths: ByStep = {}
-        for key, truth_topic in found.items():
-            if key.stage == TRUTH.name:  # refused where the state is another one than ours
-                truths, _ = _decoded(recording, truth_topic, Decoder(TRUTH, TRUTH_SENDER, sizes={"nx": nx}), "x")
+        # refused, all of it, where the recorded state has another size than ours
+        truths, _ = _decoded(recording, keys.truth_key(run), Decoder(TRUTH, TRUTH_SENDER, sizes={"nx": nx}), "x")
     return measurements, truths, len(refusals)
 
 
@@ -135,13 +132,6 @@ def _number(row: _Row, column: str) -> float:
     if isinf(number):
         raise row.wrong(column, "expected a finite number or nothing")
     return number
-
-
-def _key(topic: str) -> keys.Key | None:
-    try:
-        return keys.parse(topic)
-    except MessageError:
-        return None
 
 
 def _decoded(recording: Recording, topic: str, decoder: Decoder, field: str) -> tuple[ByStep, list[str]]:

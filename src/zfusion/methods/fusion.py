@@ -4,8 +4,8 @@ Source: Caballero-Águila et al., Information Fusion 45 (2019) 324-332, Theorem 
 reference, z_j = x̂^j - x̂^i for the neighbours and z_0 = m - x̂^i for the prior mean, which is free information;
 
     x̂_fused = x̂^i + c Z⁺ z,   Σ = P^(ii) - c Z⁺ cᵀ
-    c_j = P^(ii) - P^(ij),   Z_jl = P^(ii) - P^(il) - P^(ji) + P^(jl)
-    prior:  P^(0l) = P^(l0) = P^(ll),  P^(00) = Cov[x_k],  so c_0 = 0
+    c_j = P^(ii) - P^(ij),    Z_jl = P^(ii) - P^(il) - P^(ji) + P^(jl)
+    prior: P^(0l) = P^(l0) = P^(ll), so c_0 = 0 and Z_0l = P^(ll) - P^(il);   Z_00 = Cov[x_k] - P^(ii)
 
 It is Theorem 2 exactly where m = 0, never worse elsewhere, and does not depend on where the origin lies.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zfusion.model.statistics import Array
+from zfusion.model.types import Array
 
 TWIN = 1e-13
 """A difference of estimates whose variance is below this fraction of the own error's variance is rounding.
@@ -40,30 +40,23 @@ def fusion_weights(own: Array, cross: Array, among: Array, prior: Array) -> tupl
     """
     *batch, d, nx, _ = cross.shape
     n = (1 + d) * nx
-    everybody = np.empty((*batch, 1 + d, 1 + d, nx, nx))  # the prior is one more node, whose P^(0j) is P^(jj)
-    everybody[..., 1:, 1:, :, :] = among
-    each = among[..., np.arange(d), np.arange(d), :, :]
-    everybody[..., 0, 1:, :, :] = each
-    everybody[..., 1:, 0, :, :] = each
-    known = bool(np.isfinite(prior).all())
-    everybody[..., 0, 0, :, :] = prior if known else own
-    to_own = np.concatenate((own[..., None, :, :], cross), axis=-3)
-    c = own[..., None, :, :] - to_own
-    Z = (
-        own[..., None, None, :, :]
-        + everybody
-        - to_own[..., None, :, :, :]
-        - to_own.swapaxes(-1, -2)[..., None, :, :]
+    c = np.zeros((*batch, nx, 1 + d, nx))
+    c[..., 1:, :] = (own[..., None, :, :] - cross).swapaxes(-3, -2)
+    Z = np.zeros((*batch, 1 + d, 1 + d, nx, nx))
+    Z[..., 1:, 1:, :, :] = (
+        own[..., None, None, :, :] - cross[..., None, :, :, :] - cross.swapaxes(-1, -2)[..., None, :, :] + among
     )
-    if not known:
-        Z[..., 0, :, :, :] = 0.0
-        Z[..., :, 0, :, :] = 0.0
+    if np.isfinite(prior).all():
+        each = np.arange(d)
+        Z[..., 0, 0, :, :] = prior - own
+        Z[..., 0, 1:, :, :] = among[..., each, each, :, :] - cross
+        Z[..., 1:, 0, :, :] = Z[..., 0, 1:, :, :].swapaxes(-1, -2)
     Z = Z.swapaxes(-3, -2).reshape(*batch, n, n)
-    c = c.swapaxes(-3, -2).reshape(*batch, nx, n)
-    scale = np.tile(np.einsum("...aa->...a", own), 1 + d)
-    weights: Array = c @ _pseudo_inverse(Z, scale)
-    covariance = own - weights @ c.swapaxes(-1, -2)
-    return weights, 0.5 * (covariance + covariance.swapaxes(-1, -2))
+    c = c.reshape(*batch, nx, n)
+    variances = np.einsum("...aa->...a", own)
+    weights: Array = c @ _pseudo_inverse(Z, np.concatenate((variances,) * (1 + d), axis=-1))
+    gained = weights @ c.swapaxes(-1, -2)
+    return weights, own - 0.5 * (gained + gained.swapaxes(-1, -2))
 
 
 def fuse(own: Array, others: Array, mean: Array, weights: Array) -> Array:
@@ -77,10 +70,9 @@ def _pseudo_inverse(Z: Array, reference: Array) -> Array:
     """Z⁺ on the unit-diagonal scaling; rows of variance below TWIN times `reference` have no part in it."""
     variance = np.einsum("...aa->...a", Z)
     alive = variance > TWIN * reference
-    scale = np.where(alive, 1.0 / np.sqrt(np.where(alive, variance, 1.0)), 0.0)
-    unit = Z * scale[..., :, None] * scale[..., None, :]
-    values, vectors = np.linalg.eigh(0.5 * (unit + unit.swapaxes(-1, -2)))
-    keep = values > SMALLEST_EIGENVALUE
-    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
-    pseudo: Array = (vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2)
-    return pseudo * scale[..., :, None] * scale[..., None, :]
+    scale = alive / np.sqrt(np.where(alive, variance, 1.0))
+    scales = scale[..., :, None] * scale[..., None, :]
+    values, vectors = np.linalg.eigh(Z * scales)
+    kept = values > SMALLEST_EIGENVALUE
+    scaled: Array = vectors * (kept / np.where(kept, values, 1.0))[..., None, :]
+    return (scaled @ vectors.swapaxes(-1, -2)) * scales

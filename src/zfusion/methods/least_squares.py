@@ -16,15 +16,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from zfusion.methods.covariances import Bools, Layout, advance, prior
-from zfusion.model.statistics import Array, NodeId, StepModel
+from zfusion.model.statistics import StepModel
+from zfusion.model.types import Array, NodeId
 
 
 class LeastSquaresFilter:
     """The filter of one node, from its prior at step `born` - 1 on."""
 
-    def __init__(
-        self, neighbourhood: Sequence[NodeId], sizes: Mapping[NodeId, int], mean: Array, covariance: Array
-    ):
+    def __init__(self, neighbourhood: Sequence[NodeId], sizes: Mapping[NodeId, int], mean: Array, covariance: Array):
         """Start from the prior moments of step `born` - 1, (nx,) and (nx, nx)."""
         self._neighbourhood = tuple(neighbourhood)
         self._layout = Layout.build({0: self._neighbourhood}, {j: sizes[j] for j in self._neighbourhood})

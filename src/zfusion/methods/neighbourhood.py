@@ -14,8 +14,9 @@ from itertools import islice
 
 import numpy as np
 
-from zfusion.methods.covariances import Bools, Ints, Layout, State, advance, forget, prior
-from zfusion.model.statistics import Array, NodeId, PriorMoments, StepModel
+from zfusion.methods.covariances import Bools, Layout, State, advance, forget, prior
+from zfusion.model.statistics import PriorMoments, StepModel
+from zfusion.model.types import Array, NodeId
 from zfusion.used_sets import Ledger, UsedSet
 
 WINDOW = 64
@@ -88,7 +89,6 @@ class Neighbourhood:
         self._head = start
         self._recent: dict[int, Tracked] = {0: start}
         self._aside: dict[int, Tracked] = {}
-        self._index, self._flipped = self._pair_table()
         self._masks: dict[tuple[UsedSet | None, ...], Bools] = {}
 
     def follow(self, step: int, ledger: Ledger) -> None:
@@ -117,9 +117,7 @@ class Neighbourhood:
     def blocks(self, others: Collection[NodeId]) -> tuple[Array, Array, Array]:
         """P^(ii) (nx, nx), P^(ij) (d, nx, nx) and P^(jl) (d, d, nx, nx) for the sorted `others`, at the newest step."""
         chosen = [self._own, *(self._nodes.index(node) for node in others)]
-        grid = np.ix_(chosen, chosen)
-        P = self._head.state.P[self._index[grid]]
-        P = np.where(self._flipped[grid][:, :, None, None], P.swapaxes(-1, -2), P)
+        P = self._head.state.P[np.array(chosen)[:, None], :, self._layout.places(chosen)]
         return P[0, 0], P[0, 1:], P[1:, 1:]
 
     def moments(self, step: int) -> PriorMoments:
@@ -142,8 +140,7 @@ class Neighbourhood:
             state = forget(self._layout, state, np.flatnonzero(begins).tolist(), covariance)
         used = tuple(None if h is None else h.at(step) for h in histories)
         exact = tuple(
-            (known or begin) and of is not None
-            for known, begin, of in zip(head.exact, begins, used, strict=True)
+            (known or begin) and of is not None for known, begin, of in zip(head.exact, begins, used, strict=True)
         )
         return Tracked(step, advance(self._layout, state, self._models.at(step)[0], self._mask(used)), exact)
 
@@ -185,12 +182,3 @@ class Neighbourhood:
         if base.step not in self._recent:
             self._recent = {base.step: base}
         self._head = base
-
-    def _pair_table(self) -> tuple[Ints, Bools]:
-        """Index of the pair of any two positions, and whether it is stored the other way round, both (n, n)."""
-        n = len(self._nodes)
-        index, flipped = np.zeros((n, n), dtype=np.intp), np.zeros((n, n), dtype=np.bool_)
-        for pair, (left, right) in enumerate(zip(self._layout.left, self._layout.right, strict=True)):
-            index[left, right] = index[right, left] = pair
-            flipped[right, left] = left != right
-        return index, flipped

@@ -64,7 +64,5 @@ class Method(Protocol):
     def begin(self, step: int, y: Array | None) -> Fields:
         """Fields of the first stage, from the own measurement (ny,), None where the sensor had none."""
 
-    def advance(
-        self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger
-    ) -> Fields | Outcome:
+    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
         """Take in what arrived of a stage, the own message included; the next stage's fields, or the outcome."""

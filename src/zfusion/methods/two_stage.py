@@ -52,9 +52,7 @@ class Centralized:
         """The measurement, as it is."""
         return {"y": y}
 
-    def advance(
-        self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger
-    ) -> Fields | Outcome:  # noqa: ARG002
+    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
         """Filter with what arrived."""
         used = self._filter_step(step, arrived)
         return Outcome(self._filter.x, self._filter.P, used)
@@ -104,9 +102,7 @@ class TwoStage(Centralized):
         )
         self._weights: _Weights | None = None
 
-    def advance(
-        self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger
-    ) -> Fields | Outcome:
+    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
         """Stage 0: the intermediate estimate; stage 1: the estimate."""
         if stage == 0:
             used = self._filter_step(step, arrived)
