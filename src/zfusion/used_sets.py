@@ -34,20 +34,20 @@ class History:
 
     born: int
     last: int = field(default=-1)
+    """The last step of which anything is known; `born` - 1 where nothing is."""
     _starts: list[int] = field(default_factory=list)
     _sets: list[UsedSet | None] = field(default_factory=list)
+    """From each start to the next, or to `last`; None where it is not known. No two neighbours are equal."""
 
     def __post_init__(self) -> None:
         self.last = max(self.last, self.born - 1)
 
     def at(self, step: int) -> UsedSet | None:
         """The used set of `step`; None where it is not known."""
-        if step < self.born:
-            return ()
-        if step > self.last:
-            return None
+        if step >= self.last:
+            return self._sets[-1] if step == self.last and self._sets else self._before(step)
         run = bisect_right(self._starts, step) - 1
-        return self._sets[run] if run >= 0 else None
+        return self._sets[run] if run >= 0 else self._before(step)
 
     def first_unknown(self, start: int, end: int) -> int | None:
         """The first step in [start, end] whose used set is not known."""
@@ -56,7 +56,7 @@ class History:
             run = bisect_right(self._starts, step) - 1
             if step > self.last or run < 0 or self._sets[run] is None:
                 return step
-            step = self._starts[run + 1] if run + 1 < len(self._starts) else self.last + 1
+            step = self._end(run) + 1
         return None
 
     def learn(self, step: int, used: UsedSet, earlier: Sequence[Run] = ()) -> int | None:
@@ -65,29 +65,59 @@ class History:
         `earlier` is ascending and speaks of every step from its first run's on, to `step` - 1. Returns the
         first step of which something new is known now, None where nothing is.
         """
-        if step == self.last + 1 and self._agrees(earlier):
+        if step == self.last + 1 and self._is_known(earlier):
             self._append(step, used)
             return step
-        before = [*earlier, (step, used)]
-        return self._overlay(before, step)
+        return self.fill((*earlier, (step, used)), step)
+
+    def fill(self, told: Sequence[Run], end: int) -> int | None:
+        """Take in ascending runs that speak of every step from the first one's on, to `end`.
+
+        Where they contradict what was known they are right: a node knows best what it used. Returns as `learn`.
+        """
+        changed = self._first_difference(told, end)
+        if changed is None:
+            return None
+        start = told[0][0]
+        runs: list[tuple[int, UsedSet | None]] = [(s, u) for s, u in self._runs() if s < start]
+        if start > self.last + 1:
+            runs.append((self.last + 1, None))
+        runs.extend(told)
+        if end < self.last:
+            runs.append((end + 1, self.at(end + 1)))
+            runs.extend((s, u) for s, u in self._runs() if s > end + 1)
+        merged = [run for n, run in enumerate(runs) if n == 0 or run[1] != runs[n - 1][1]][-KEPT_RUNS:]
+        self._starts, self._sets = [s for s, _ in merged], [u for _, u in merged]
+        self.last = max(self.last, end)
+        return changed
 
     def runs(self, end: int, limit: int | None = None) -> list[Run]:
-        """The last known runs up to `end` in a row, at most `limit` of them; the first may be cut off there."""
+        """The known runs up to `end` that follow on one another, at most the last `limit` of them, ascending."""
         found: list[Run] = []
         for start, used in zip(reversed(self._starts), reversed(self._sets), strict=True):
             if start > end:
                 continue
-            if used is None or (limit is not None and len(found) == limit):
+            if used is None or len(found) == limit:
                 break
             found.append((start, used))
         return found[::-1]
 
-    def _agrees(self, earlier: Sequence[Run]) -> bool:
-        """Whether the last run told is the one that is known to go on until `last` (all a neighbour repeats)."""
-        if not earlier:
-            return self.last == self.born - 1 or bool(self._sets)
-        start, used = earlier[-1]
-        return self.last >= self.born and self._sets[-1] == used and self._starts[-1] == start
+    def _before(self, step: int) -> UsedSet | None:
+        return () if step < self.born else None
+
+    def _end(self, run: int) -> int:
+        return self._starts[run + 1] - 1 if run + 1 < len(self._starts) else self.last
+
+    def _runs(self) -> Iterable[tuple[int, UsedSet | None]]:
+        return zip(self._starts, self._sets, strict=True)
+
+    def _is_known(self, told: Sequence[Run]) -> bool:
+        """Whether `told` just repeats the last runs, as nearly every message does."""
+        first = len(self._starts) - len(told)
+        if first < 0:
+            return False
+        last_runs = zip(told, self._starts[first:], self._sets[first:], strict=True)
+        return all(run[0] == start and run[1] == used for run, start, used in last_runs)
 
     def _append(self, step: int, used: UsedSet) -> None:
         if not self._sets or self._sets[-1] != used:
@@ -97,30 +127,6 @@ class History:
                 del self._starts[0], self._sets[0]
         self.last = step
 
-    def _overlay(self, told: Sequence[Run], end: int) -> int | None:
-        """Replace what is known of [told[0].start, end] by what is told; the first step that changed."""
-        start = told[0][0]
-        changed = self._first_difference(told, end)
-        if changed is None:
-            return None
-        tail = [(s, u) for s, u in self._known() if s > end]
-        if self.last > end and (not tail or tail[0][0] > end + 1):
-            tail.insert(0, (end + 1, self.at(end + 1)))
-        head: list[tuple[int, UsedSet | None]] = [(s, u) for s, u in self._known() if s < start]
-        if start > self.last + 1:
-            head.append((self.last + 1, None))
-        merged: list[tuple[int, UsedSet | None]] = []
-        for run in (*head, *told, *tail):
-            if not merged or merged[-1][1] != run[1]:
-                merged.append(run)
-        merged = merged[-KEPT_RUNS:]
-        self._starts, self._sets = [s for s, _ in merged], [u for _, u in merged]
-        self.last = max(self.last, end)
-        return changed
-
-    def _known(self) -> Iterable[tuple[int, UsedSet | None]]:
-        return zip(self._starts, self._sets, strict=True)
-
     def _first_difference(self, told: Sequence[Run], end: int) -> int | None:
         """The first step of [told[0].start, end] where `told` says something else than what is known."""
         for number, (start, used) in enumerate(told):
@@ -129,8 +135,8 @@ class History:
             while step < stop:
                 if self.at(step) != used:
                     return step
-                run = bisect_right(self._starts, step)
-                step = min(stop, self._starts[run] if run < len(self._starts) else self.last + 1)
+                run = bisect_right(self._starts, step) - 1
+                step = self._end(run) + 1
         return None
 
 
@@ -154,14 +160,21 @@ class Ledger:
             self._note(node, born)
         elif history.born > born:
             return  # a former life speaks: its neighbours have begun anew with the present one
-        changed = history.learn(step, used, earlier)
-        if changed is not None:
-            self._note(node, changed)
+        self._note(node, history.learn(step, used, earlier))
+
+    def fill(self, node: NodeId, born: int, end: int, runs: Sequence[Run]) -> bool:
+        """Take in an answer about the present life of `node`; False where it is about another one."""
+        history = self._of.get(node)
+        if history is None or history.born != born:
+            return False
+        self._note(node, history.fill(runs, end))
+        return True
 
     def take_changes(self) -> dict[NodeId, int]:
         """For each node of which something new is known since the last call: the first step it concerns."""
         changes, self._changed = self._changed, {}
         return changes
 
-    def _note(self, node: NodeId, step: int) -> None:
-        self._changed[node] = min(step, self._changed.get(node, step))
+    def _note(self, node: NodeId, step: int | None) -> None:
+        if step is not None:
+            self._changed[node] = min(step, self._changed.get(node, step))

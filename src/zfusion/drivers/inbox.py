@@ -1,8 +1,9 @@
 """Waiting on Zenoh: for one neighbour's next message, until a deadline, or until something else happens.
 
-A message waits in a channel of its own key until it is wanted, so that a node which is ahead of its listeners is
-held back by them, not by memory. Zenoh's channels can be waited on without a time limit only; what ends the wait
-here is a *bell*: a message on the same key that never leaves this session, put there by a watching thread.
+A message waits in a channel of its own key until it is wanted. Zenoh's channels can be waited on without a time limit
+only; what ends a wait here is a *bell*: a message on the same key that never leaves this session, put there by a
+watching thread. A wait is ended, too, when it has gone on for a while: a channel that nobody reads may be full by then,
+and a full one holds up all that comes to this session.
 """
 
 from __future__ import annotations
@@ -12,21 +13,52 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
-from typing import Any, TypeVar
+from contextlib import suppress
+from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 
 Channel = TypeVar("Channel", bound=Hashable)
 
-CHANNEL = 256
-"""Messages of one key that wait here; beyond that they wait in the sockets, and then at the sender."""
+CHANNEL = 16_384
+"""Messages of one key that wait here; beyond that they wait in the sockets, and then at the sender. Room for what a swarm
+says while one of its nodes, just restarted, gets ready to follow it."""
 
-ECHO_S = 0.002
-"""After this the bell is rung again if it was not heeded: the wait may have begun just after it."""
+STRETCH_NS = 10_000_000
+"""How long a wait may go on before it is ended so that the other channels can be looked into: far longer than the waits
+of a swarm in step, far shorter than deadlines of seconds."""
+
+NEVER = 2**63
+"""Later than every time on the clock, in nanoseconds."""
+
+
+class Wake:
+    """Ends another thread's wait, or its next one. Unlike `threading.Event` it may be used in a signal handler, whatever
+    the thread that this interrupts is doing."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def set(self) -> None:
+        """End the wait. Twice is once."""
+        with suppress(RuntimeError):  # it is set already
+            self._lock.release()
+
+    def wait(self, seconds: float) -> None:
+        """Wait for `set`, at most so long."""
+        self._lock.acquire(timeout=min(seconds, threading.TIMEOUT_MAX))
+
+
+class _Wait(NamedTuple):
+    """One wait of the owner's thread; each is an object of its own."""
+
+    key: str
+    deadline_ns: int
 
 
 class Inbox:
-    """The channels of a node, and its alarm clock."""
+    """The channels of a node, and its alarm clock. For one thread; `notify` is for all."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.notices: deque[Any] = deque()
@@ -35,12 +67,11 @@ class Inbox:
         self._channels: dict[Hashable, Any] = {}
         self._keys: dict[Hashable, str] = {}
         self._bell = os.urandom(16)
-        self._waiting_on: str | None = None
-        self._deadline_s = float("inf")
-        self._target_s = float("inf")
-        self._rung = False
-        self._alarm = threading.Event()
-        self._changed = threading.Condition()
+        self._wait: _Wait | None = None
+        self._alarm = Wake()
+        self._nudge = Wake()
+        self._wakes_ns = 0
+        """When the watcher looks again, by itself."""
         self._open = True
         self._watcher = threading.Thread(target=self._watch, name="inbox", daemon=True)
         self._watcher.start()
@@ -63,7 +94,7 @@ class Inbox:
         return self._channels[source].handler.try_recv()
 
     def wait(self, source: Hashable, deadline_ns: int | None) -> bytes | None:
-        """The next message; None when the deadline has passed (wall clock) or there is a notice."""
+        """The next message; None when the deadline has passed (wall clock), there is a notice, or for a change."""
         sample = self.wait_sample(source, deadline_ns)
         if sample is None:
             return None
@@ -75,31 +106,28 @@ class Inbox:
         channel = self._channels[source].handler
         sample = channel.try_recv()
         if sample is None:
-            self._set_deadline(deadline_ns)
-            self._waiting_on = self._keys[source]
+            wait = self._wait = _Wait(self._keys[source], NEVER if deadline_ns is None else deadline_ns)
+            if wait.deadline_ns <= self._wakes_ns:
+                self._nudge.set()
             if not self.notices:
                 sample = channel.recv()
-            self._waiting_on = None
-            self._deadline_s = float("inf")
+            self._wait = None
         return sample
 
     def rest(self, until_ns: int) -> bool:
         """Sleep until a time (wall clock); False if there is a notice before."""
         while not self.notices:
-            left = (until_ns - time.time_ns()) / 1e9
-            if left <= 0:
+            left_ns = until_ns - time.time_ns()
+            if left_ns <= 0:
                 return True
-            self._alarm.wait(left)
-            self._alarm.clear()
+            self._alarm.wait(left_ns / 1e9)
         return False
 
     def notify(self, notice: object) -> None:
-        """Leave a notice and end whatever wait there is. For callbacks: it neither blocks nor calls Zenoh."""
+        """Leave a notice and end whatever wait there is. For callbacks and signal handlers: it does not block."""
         self.notices.append(notice)
         self._alarm.set()
-        with self._changed:
-            self._rung = True
-            self._changed.notify()
+        self._nudge.set()
 
     def drain(self, sources: Iterable[Channel], take: Callable[[Channel, bytes], None]) -> None:
         """Take all that has arrived from the given sources."""
@@ -110,35 +138,23 @@ class Inbox:
     def close(self) -> None:
         """Stop receiving; what is still in the channels is dropped."""
         self._open = False
-        with self._changed:
-            self._changed.notify()
+        self._nudge.set()
         self._watcher.join()
         for channel in self._channels.values():
-            while channel.handler.try_recv() is not None:
-                pass
-            channel.undeclare()
-
-    def _set_deadline(self, deadline_ns: int | None) -> None:
-        """Deadlines mostly grow: the watcher, asleep until an earlier one, finds the later one by itself."""
-        if deadline_ns is None:
-            return
-        left_s = (deadline_ns - time.time_ns()) / 1e9
-        with self._changed:
-            self._deadline_s = time.monotonic() + left_s
-            if self._deadline_s < self._target_s:
-                self._changed.notify()
+            channel.undeclare()  # a session with a full channel would not close
 
     def _watch(self) -> None:
+        seen = rung = None
         while self._open:
-            with self._changed:
-                left_s = self._deadline_s - time.monotonic()
-                if left_s > 0 and not self._rung:
-                    self._target_s = self._deadline_s
-                    self._changed.wait(None if left_s == float("inf") else left_s)
-                    continue
-            key = self._waiting_on
-            if key is not None:
-                self._session.put(key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)
-            with self._changed:
-                self._changed.wait(ECHO_S)
-                self._rung = bool(self.notices)
+            self._wakes_ns = NEVER  # first of all, so that a wait that begins now does not rely on this look
+            wait, now = self._wait, time.time_ns()
+            if wait is None:
+                self._nudge.wait(threading.TIMEOUT_MAX)
+                continue
+            if wait is not rung and (wait is seen or now >= wait.deadline_ns or self.notices):
+                self._session.put(wait.key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+                rung = wait
+            seen = wait
+            wakes_ns = now + STRETCH_NS
+            self._wakes_ns = min(wakes_ns, wait.deadline_ns) if wait is not rung else wakes_ns
+            self._nudge.wait((self._wakes_ns - now) / 1e9)

@@ -18,21 +18,21 @@ before. Messages are taken as they come and forgotten when nobody needs them any
 from __future__ import annotations
 
 from bisect import insort
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from enum import Enum
 from typing import cast
 
 import numpy as np
 
 from zfusion import keys
-from zfusion.drivers.verdict import NAMED, TOLERANCE, Comparison, Difference, Tally, Verdict
+from zfusion.drivers.verdict import EXACT, NAMED, TOLERANCE, Comparison, Difference, Tally, Verdict
 from zfusion.errors import InputError, MessageError
 from zfusion.gaps import MAX_LIVES
-from zfusion.messages import Decoder, Reason
+from zfusion.messages import Decoder, Reason, encode_any
 from zfusion.methods import METHODS, Setting
 from zfusion.model.scenario import Scenario
-from zfusion.model.types import NodeId
+from zfusion.model.types import Array, NodeId
 from zfusion.node import Effect, Node, Patience
 from zfusion.recording.provenance import arithmetic_differences
 from zfusion.recording.reader import Recording
@@ -46,6 +46,9 @@ listen on a link for each node, and one may be ahead of the other by what fits i
 TIDY_EVERY = 256
 """Messages of a node after which what nobody needs any more of them is forgotten."""
 
+_Place = tuple[NodeId, str, int]
+"""(sender, stage, step)."""
+
 
 class _Doubt(Enum):
     """Why a difference proves nothing."""
@@ -54,53 +57,70 @@ class _Doubt(Enum):
     CUT_OFF = "the recording ends before something that it depends on"
 
 
-class _Life:
-    """One life of a node: what is on the recording of it, and the node that lives it again."""
+class _Shelf:
+    """The messages of one node that somebody may still need, by stage and step."""
 
-    def __init__(self, node: NodeId, born: int, stages: Iterable[str], tolerance: float | None) -> None:
+    def __init__(self, stages: Iterable[str]) -> None:
+        self.by_stage: dict[str, dict[int, Message]] = {stage: {} for stage in stages}
+        self.disputed: set[tuple[str, int]] = set()
+        """(stage, step) of which there are two that differ: of two lives, or because somebody else spoke too."""
+        self._second: dict[tuple[str, int, int], Message] = {}
+        """By stage, step and life: those of a second life at a step."""
+
+    def put(self, message: Message) -> bool:
+        """Keep a message; False if it is there already. Of two of one life the first counts, as it does for nodes."""
+        stage, step = message.stage, message.step
+        known = self.by_stage[stage].setdefault(step, message)
+        if known is message:
+            return True
+        if known.born == message.born:
+            if EXACT.differs(stage, known.fields, message.fields):
+                self.disputed.add((stage, step))
+            return False
+        self.disputed.add((stage, step))
+        return self._second.setdefault((stage, step, message.born), message) is message
+
+    def said(self, stage: str, step: int, born: int) -> Message | None:
+        """What the node said in the life that began at `born`."""
+        message = self.by_stage[stage].get(step)
+        return message if message is None or message.born == born else self._second.get((stage, step, born))
+
+    def forget(self, floor: int) -> None:
+        """Drop what is of steps up to `floor`."""
+        for stage, messages in self.by_stage.items():
+            self.by_stage[stage] = {step: message for step, message in messages.items() if step > floor}
+        self.disputed = {place for place in self.disputed if place[1] > floor}
+        self._second = {place: message for place, message in self._second.items() if place[1] > floor}
+
+
+class _Life:
+    """One life of a node: how far it was lived again."""
+
+    def __init__(self, node: NodeId, born: int, tolerance: float | None) -> None:
         self.id, self.born = node, born
-        self.messages: dict[str, dict[int, Message]] = {stage: {} for stage in stages}
-        """By stage and step."""
-        self.twice: set[tuple[str, int]] = set()
-        """(stage, step) of which there are two, that differ."""
-        self.told: defaultdict[int, list[tuple[NodeId, HistoryAnswer]]] = defaultdict(list)
-        """By step: histories that were asked for."""
+        self.node: Node | None = None
+        """Made when the first step is lived again."""
         self.steps: list[int] = []
         """Begun, and not lived again yet; ascending."""
         self.done = born - 1
         """The last step that was lived again."""
-        self.awaits: tuple[NodeId, str, int] | None = None
-        """The input that it waits for: (sender, stage, step)."""
+        self.told: dict[int, list[tuple[NodeId, HistoryAnswer]]] = {}
+        """By step: histories that were asked for."""
+        self.awaits: _Place | None = None
+        """The input that it waits for."""
         self.counters: dict[str, int] = {}
         """By stage: the number of the next message."""
+        self.heard: dict[NodeId, int] = {}
+        """The neighbours' lives that it has heard."""
         self.doubt: _Doubt | None = None
         self.comparison = Comparison(tolerance)
-        self.node: Node | None = None
-        self.lives: dict[NodeId, int] = {}
-        """The neighbours' lives that it has heard."""
 
-    def take(self, message: Message) -> bool:
-        """Take a message of this life in; False where it is old, or here already."""
-        stage, step = message.stage, message.step
-        known = self.messages[stage].get(step)
-        if known is not None and Comparison(None).differs(stage, known.fields, message.fields):
-            self.twice.add((stage, step))
-        if known is not None or step <= self.done:
-            return False
-        self.messages[stage][step] = message
+    def begin(self, step: int) -> None:
+        """A message of `step` is there."""
         if not self.steps or step > self.steps[-1]:
             self.steps.append(step)
         elif step not in self.steps:
             insort(self.steps, step)
-        return True
-
-    def forget(self, floor: int) -> None:
-        """Drop what is of steps up to `floor`."""
-        for stage, messages in self.messages.items():
-            self.messages[stage] = {step: message for step, message in messages.items() if step > floor}
-
-
-_Take = Callable[[bytes], None]
 
 
 class _Verifier:
@@ -110,15 +130,18 @@ class _Verifier:
         self._scenario, self._complete, self._tolerance = scenario, complete, tolerance
         self._method = METHODS[scenario.method.name]
         self._graph = self._method.network(scenario.network)
+        self._tables = {stage.name: stage for stage in (*self._method.stages, ESTIMATE, EVENT)}
         self._stages = [stage.name for stage in self._method.stages]
         self._published = [*self._stages, ESTIMATE.name]
         self._order = {stage: number for number, stage in enumerate(self._published)}
         self._nobody = _another_id(self._graph.ids)
-        self._lives: dict[NodeId, dict[int, _Life]] = {node: {} for node in self._graph.ids}
-        self._done = dict.fromkeys(self._graph.ids, 0)
-        self._untidy = dict.fromkeys(self._graph.ids, 0)
-        self._waiting: dict[tuple[NodeId, str, int], list[_Life]] = {}
-        self.tallies = {node: Tally() for node in self._graph.ids}
+        ids = self._graph.ids
+        self._shelves = {node: _Shelf(self._published) for node in ids}
+        self._lives: dict[NodeId, dict[int, _Life]] = {node: {} for node in ids}
+        self._done = dict.fromkeys(ids, 0)
+        self._untidy = dict.fromkeys(ids, 0)
+        self._waiting: dict[_Place, list[_Life]] = {}
+        self.tallies = {node: Tally() for node in ids}
         self.first: Difference | None = None
         self.missing: list[str] = []
         self.missing_count = 0
@@ -129,19 +152,16 @@ class _Verifier:
         """Lives of nodes on the recording so far."""
         return sum(map(len, self._lives.values()))
 
-    def taker(self, topic: str) -> _Take | None:
+    def taker(self, topic: str) -> Callable[[bytes], None] | None:
         """What takes the messages of a topic in; None where they are of no importance."""
         try:
             key = keys.parse(topic)
             node = self._scenario.node_id(key.node or "")
         except (MessageError, KeyError):
             return None
-        system, graph = self._scenario.system(), self._graph
-        sizes, ids = {"nx": system.nx, "ny": system.by_id[node].ny}, graph.neighbours(node)
-        tables = {stage.name: stage for stage in (*self._method.stages, ESTIMATE, EVENT)}
-        if key.stage not in tables:
+        if key.stage not in self._tables:
             return None
-        decode = Decoder(tables[key.stage], node, sizes=sizes, ids=ids).decode
+        decode = self._decoder(node, key.stage).decode
         take = self._take_event if key.stage == EVENT.name else self._take_message
 
         def decode_and_take(data: bytes) -> None:
@@ -154,19 +174,24 @@ class _Verifier:
 
     def finish(self) -> None:
         """Nothing more comes: live again what is left."""
-        self._waiting.clear()
         for lives in self._lives.values():
             for life in lives.values():
                 self._go_on(life, ended=True)
 
+    def _decoder(self, node: NodeId, stage: str) -> Decoder:
+        system = self._scenario.system()
+        sizes = {"nx": system.nx, "ny": system.by_id[node].ny}
+        return Decoder(self._tables[stage], node, sizes=sizes, ids=self._graph.neighbours(node))
+
     def _take_message(self, message: Message) -> None:
         node, stage, step = message.node, message.stage, message.step
         life = self._life(node, message.born)
-        if not life.take(message):
+        if step <= life.done or not self._shelves[node].put(message):
             return
-        waiters = self._waiting.pop((node, stage, step), None)
+        life.begin(step)
+        waiters = self._waiting.pop((node, stage, step), ())
         self._go_on(life)
-        for waiter in waiters or ():
+        for waiter in waiters:
             waiter.awaits = None
             self._go_on(waiter)
         self._untidy[node] += 1
@@ -176,14 +201,29 @@ class _Verifier:
     def _take_event(self, message: Message) -> None:
         life = self._life(message.node, message.born)
         self._count(life, message)
-        if message.fields["kind"] != "history":
-            return
         data = cast("dict[str, object]", message.fields["data"])
-        of = cast(NodeId, data.get("of"))
-        if of not in self._graph.neighbours(message.node):
-            raise MessageError(Reason.UNKNOWN_ID, f"history of {of!r}")
-        answer = HistoryAnswer.from_map(data, frozenset(self._graph.neighbours(of)))
-        life.told[message.step].append((of, answer))
+        if message.fields["kind"] == "history":
+            of = self._neighbour(message.node, data)
+            answer = HistoryAnswer.from_map(data, frozenset(self._graph.neighbours(of)))
+            life.told.setdefault(message.step, []).append((of, answer))
+        elif message.fields["kind"] == "gone":
+            self._take_last_words(self._neighbour(message.node, data), data.get("last"))
+
+    def _neighbour(self, node: NodeId, data: Mapping[str, object]) -> NodeId:
+        """The neighbour that an event is about."""
+        of = data.get("of")
+        if not isinstance(of, int | str) or of not in self._graph.neighbours(node):
+            raise MessageError(Reason.UNKNOWN_ID, f"an event about {of!r}")
+        return of
+
+    def _take_last_words(self, node: NodeId, last: object) -> None:
+        """What somebody heard last of a node that died: it may never have come to the recorder."""
+        for payload in last if isinstance(last, list) else ():
+            for stage in self._stages:
+                with suppress(MessageError):
+                    message = self._decoder(node, stage).decode(encode_any(payload))
+                    if self._shelves[node].said(stage, message.step, message.born) is None:
+                        self._take_message(message)
 
     def _life(self, node: NodeId, born: int) -> _Life:
         lives = self._lives[node]
@@ -191,69 +231,84 @@ class _Verifier:
         if life is None:
             if len(lives) == MAX_LIVES:
                 raise MessageError(Reason.OUT_OF_RANGE, f"more than {MAX_LIVES} lives")
-            life = lives[born] = _Life(node, born, self._published, self._tolerance)
+            life = lives[born] = _Life(node, born, self._tolerance)
         return life
 
     def _go_on(self, life: _Life, ended: bool = False) -> None:
-        """Live the steps again that can be: those of which all is there, or nothing more is to be expected."""
-        while life.steps:
-            step = life.steps[0]
-            if not ended:
-                if len(life.steps) == 1 and step not in life.messages[ESTIMATE.name]:
-                    return
-                if len(life.steps) <= WAIT_STEPS:
-                    if life.awaits is not None:
-                        return
-                    life.awaits = self._lacking(life, step)
-                    if life.awaits is not None:
-                        self._waiting.setdefault(life.awaits, []).append(life)
-                        return
-            del life.steps[0]
-            self._finish_former_lives(life)
-            self._live(life, step, last=ended and not life.steps)
+        """Live the steps again that can be: those of which all is there, or of which nothing more is to be expected."""
+        steps = life.steps
+        while steps:
+            if not ended and not self._can_go_on(life, steps[0]):
+                return
+            step = steps.pop(0)
+            if life.node is None:
+                self._finish_former_lives(life)
+            self._live(life, step, last=ended and not steps)
             life.done = step
             self._done[life.id] = max(self._done[life.id], step)
 
-    def _lacking(self, life: _Life, step: int) -> tuple[NodeId, str, int] | None:
+    def _can_go_on(self, life: _Life, step: int) -> bool:
+        """Whether the step is over and its inputs are there, or have been waited for long enough."""
+        later = len(life.steps) - 1
+        if later >= WAIT_STEPS:
+            self._give_up(life)
+            return True
+        if life.awaits is not None or (
+            not later and self._shelves[life.id].said(ESTIMATE.name, step, life.born) is None
+        ):
+            return False
+        life.awaits = self._lacking(life, step)
+        if life.awaits is not None:
+            self._waiting.setdefault(life.awaits, []).append(life)
+        return life.awaits is None
+
+    def _give_up(self, life: _Life) -> None:
+        """Wait no longer."""
+        if life.awaits is not None:
+            waiting = self._waiting[life.awaits]
+            waiting.remove(life)
+            if not waiting:
+                del self._waiting[life.awaits]
+            life.awaits = None
+
+    def _lacking(self, life: _Life, step: int) -> _Place | None:
         """The first input of a step that is not there."""
+        own = self._shelves[life.id]
         for stage, following in zip(self._stages, self._published[1:], strict=True):
-            message = life.messages[following].get(step)
-            for j in () if message is None else _inputs(message):
-                if j != life.id and not any(step in other.messages[stage] for other in self._lives[j].values()):
+            told = own.said(following, step, life.born)
+            for j in () if told is None else _inputs(told):
+                if j != life.id and step not in self._shelves[j].by_stage[stage]:
                     return j, stage, step
         return None
 
     def _finish_former_lives(self, life: _Life) -> None:
         """A life that broke off within a step has that left: live it again while its inputs are still there."""
-        if life.node is None:
-            for former in self._lives[life.id].values():
-                if former.born < life.born and former.steps:
-                    self._go_on(former, ended=True)
+        for former in self._lives[life.id].values():
+            if former.born < life.born and former.steps:
+                self._go_on(former, ended=True)
 
     def _live(self, life: _Life, step: int, last: bool) -> None:
         """Live one step again. In the `last` of a life the last stages may be missing: it came no further."""
-        chain = [life.messages[stage].get(step) for stage in self._published]
-        for message in filter(None, chain):
+        shelf = self._shelves[life.id]
+        said = [shelf.said(stage, step, life.born) for stage in self._published]
+        for message in filter(None, said):
             self._count(life, message)
         node = life.node = life.node or self._make(life)
         for of, answer in life.told.pop(step, ()):
             node.learn_history(of, answer.born, answer.end, answer.runs)
-        measured, first = chain[0], chain[1]
-        if measured is not None:
-            y = measured.fields["y"]
-        else:
-            y = self._stand_in(life.id) if first is not None and life.id in _inputs(first) else None
-        node.begin(step, y, 0)  # type: ignore[arg-type]
+        node.begin(step, self._measured(life, said[0], said[1]), 0)
         for number, stage in enumerate(self._stages):
-            told = chain[number + 1]
-            if told is None and last and not any(chain[number + 1 :]):
+            following = said[number + 1]
+            if following is not None:
+                self._feed(life, node, stage, step, _inputs(following))
+                self._judge(life, following, node.tick(number + 1))
+            elif last and not any(said[number + 1 :]):
                 return
-            if told is None:
-                life.doubt = _Doubt.MISSING  # whose messages were used, nobody knows: it is counted when the next comes
-            self._feed(life, node, stage, step, told)
-            said = node.tick(number + 1)
-            if told is not None:
-                self._judge(life, told, said)
+            else:  # whose messages it used nobody knows; what is missing is counted when the next of its kind comes
+                life.doubt = _Doubt.MISSING
+                heard = (j for j in node.neighbours if j != self._nobody and step in self._shelves[j].by_stage[stage])
+                self._feed(life, node, stage, step, heard)
+                node.tick(number + 1)
 
     def _make(self, life: _Life) -> Node:
         method = self._method(Setting(life.id, self._scenario.system(), self._graph, life.born))
@@ -266,47 +321,47 @@ class _Verifier:
             expected=(self._nobody,),
         )
 
-    def _feed(self, life: _Life, node: Node, stage: str, step: int, told: Message | None) -> None:
-        """Give the node what it used of its neighbours in a stage, as `told`; all there is, where nobody told."""
+    def _measured(self, life: _Life, measurement: Message | None, following: Message | None) -> Array | None:
+        """The own measurement; if it is not there, a stand-in where there was one."""
+        if measurement is not None:
+            return cast("Array | None", measurement.fields["y"])
+        return self._stand_in(life.id) if following is not None and life.id in _inputs(following) else None
+
+    def _feed(self, life: _Life, node: Node, stage: str, step: int, senders: Iterable[NodeId]) -> None:
+        """Give the node the messages of its neighbours that it used in a stage."""
         now = self._order[stage]
-        for j in node.neighbours if told is None else _inputs(told):
-            if j in (life.id, self._nobody):
+        for j in senders:
+            if j == life.id:
                 continue
-            message = self._find(life, j, stage, step, wanted=told is not None)
+            shelf = self._shelves[j]
+            message = shelf.by_stage[stage].get(step) or self._missed(life, j, stage, step)
             if message is None:
                 continue
-            if life.lives.setdefault(j, message.born) != message.born:
-                life.lives[j] = message.born
+            if (stage, step) in shelf.disputed:
+                self._miss(life, f"which {stage} of node {j}, step {step}, node {life.id} used: there are two")
+            if life.heard.setdefault(j, message.born) != message.born:
+                life.heard[j] = message.born
                 node.gone(j, now)
             node.receive(message, now)
 
-    def _find(self, life: _Life, j: NodeId, stage: str, step: int, wanted: bool) -> Message | None:
-        """A neighbour's message. Where there is none: a stand-in for a measurement, so that at least the covariances
-
-        come out right; None for what there can be none for.
-        """
-        found = [other.messages[stage][step] for other in self._lives[j].values() if step in other.messages[stage]]
-        if found:
-            if len(found) > 1 or any((stage, step) in other.twice for other in self._lives[j].values()):
-                self._miss(life, f"which {stage} of node {j}, step {step}, node {life.id} used: there are two")
-            return found[0]
-        if not wanted:
-            return None
-        newest = max((at for other in self._lives[j].values() for at in other.messages[stage]), default=0)
+    def _missed(self, life: _Life, j: NodeId, stage: str, step: int) -> Message | None:
+        """Note an input that is missing. For a measurement there is a stand-in: the covariances come out right then."""
+        newest = max(self._shelves[j].by_stage[stage], default=0)
         cut_off = not self._complete and newest < step
         self._miss(life, f"{stage} of node {j}, step {step}, which node {life.id} used", cut_off=cut_off)
         if stage != MEASUREMENT.name:
             return None
-        born = life.lives.get(j, max((born for born in self._lives[j] if born <= step), default=1))
+        born = life.heard.get(j, max((born for born in self._lives[j] if born <= step), default=1))
         return Message(j, step, stage, 0, born, 0, {"y": self._stand_in(j)})
 
-    def _stand_in(self, node: NodeId) -> object:
+    def _stand_in(self, node: NodeId) -> Array:
         return np.zeros(self._scenario.system().by_id[node].ny)
 
-    def _judge(self, life: _Life, told: Message, said: Sequence[Effect]) -> None:
-        tally = self.tallies[life.id]
-        again = next(effect for effect in said if isinstance(effect, Message) and effect.stage == told.stage)
-        found = life.comparison.differs(told.stage, told.fields, again.fields)
+    def _judge(self, life: _Life, told: Message, effects: Sequence[Effect]) -> None:
+        """Compare what the node says with what it said."""
+        tally, stage = self.tallies[life.id], told.stage
+        again = next(effect for effect in effects if isinstance(effect, Message) and effect.stage == stage)
+        found = life.comparison.differs(stage, told.fields, again.fields)
         if found is None:
             tally.identical += 1
         elif life.doubt is _Doubt.CUT_OFF:
@@ -316,41 +371,39 @@ class _Verifier:
         else:
             tally.different += 1
             name, ulps = found
-            difference = Difference(
-                life.id, life.born, told.step, told.stage, name, told.fields[name], again.fields[name], ulps
-            )
-            if self.first is None or self._place(difference) < self._place(self.first):
-                self.first = difference
+            here = Difference(life.id, life.born, told.step, stage, name, told.fields[name], again.fields[name], ulps)
+            if self.first is None or self._place(here) < self._place(self.first):
+                self.first = here
 
     def _place(self, difference: Difference) -> tuple[int, int, int]:
         return difference.step, self._order[difference.stage], self._graph.ids.index(difference.node)
 
     def _count(self, life: _Life, message: Message) -> None:
         """Notice by the sender's counter what is missing before a message."""
-        stage = message.stage
-        lost = message.seq - life.counters.get(stage, 0)
-        life.counters[stage] = max(message.seq + 1, life.counters.get(stage, 0))
+        stage, expected = message.stage, life.counters.get(message.stage, 0)
+        lost = message.seq - expected
+        if lost >= 0:
+            life.counters[stage] = message.seq + 1
         if lost > 0:
             self._miss(life, f"{lost} x {stage} of node {life.id} before step {message.step}")
-            if stage in self._published[1:]:
+            if self._order.get(stage, 0) > 0:
                 self.tallies[life.id].unverifiable += lost
 
     def _miss(self, life: _Life, what: str, cut_off: bool = False) -> None:
         """Something that this life depends on is not there: from now on a difference proves nothing."""
-        if life.doubt is not _Doubt.MISSING:
-            life.doubt = _Doubt.CUT_OFF if cut_off else _Doubt.MISSING
-        if not cut_off:
-            self.missing_count += 1
-            if len(self.missing) < NAMED:
-                self.missing.append(what)
+        if cut_off:
+            life.doubt = life.doubt or _Doubt.CUT_OFF
+            return
+        life.doubt = _Doubt.MISSING
+        self.missing_count += 1
+        if len(self.missing) < NAMED:
+            self.missing.append(what)
 
     def _tidy(self, node: NodeId) -> None:
         """Forget messages that all who could use them are past, or that are long over."""
         self._untidy[node] = 0
         users = (node, *self._graph.listeners(node))
-        floor = max(min(self._done[i] for i in users), max(self._done.values()) - 2 * WAIT_STEPS)
-        for life in self._lives[node].values():
-            life.forget(floor)
+        self._shelves[node].forget(max(min(self._done[i] for i in users), max(self._done.values()) - 2 * WAIT_STEPS))
 
 
 def verify(recording: Recording, *, tolerance: float | None = None) -> Verdict:

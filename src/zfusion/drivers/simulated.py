@@ -17,7 +17,7 @@ from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.links import Link, ideal
 from zfusion.drivers.metrics import NodeReport
 from zfusion.drivers.sources import Source, open_sources
-from zfusion.messages import encode
+from zfusion.messages import decode_any, encode
 from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -49,6 +49,8 @@ class _Life:
         self.began_ns = now_ns
         self.busy = False
         """In a step."""
+        self.heard: dict[tuple[NodeId, str], Message] = {}
+        """The last message of each neighbour and stage."""
 
 
 class Simulation:
@@ -115,7 +117,8 @@ class Simulation:
         for listener in self._graph.listeners(node):
             life = self._alive.get(listener)
             if life is not None:
-                gone = life.node.event("gone", self.now_ns, of=node)
+                last = [decode_any(encode(message)) for (j, _), message in life.heard.items() if j == node]
+                gone = life.node.event("gone", self.now_ns, of=node, last=last)
                 self._carry_out(life, [gone, *life.node.gone(node, self.now_ns)])
 
     def revive(self, node: NodeId) -> None:
@@ -173,6 +176,7 @@ class Simulation:
     def _deliver(self, receiver: NodeId, message: Message) -> None:
         life = self._alive.get(receiver)
         if life is not None:
+            life.heard[message.node, message.stage] = message
             self._carry_out(life, life.node.receive(message, self.now_ns))
 
     def _carry_out(self, life: _Life, effects: list[Effect]) -> None:
@@ -279,9 +283,7 @@ def simulate(
     return reports
 
 
-def _sent(
-    scenario: Scenario, run: str, reports: Mapping[NodeId, list[NodeReport]]
-) -> dict[str, dict[int, int]]:
+def _sent(scenario: Scenario, run: str, reports: Mapping[NodeId, list[NodeReport]]) -> dict[str, dict[int, int]]:
     """How many messages every life put on every key."""
     sent: dict[str, dict[int, int]] = {}
     for node in scenario.ids:

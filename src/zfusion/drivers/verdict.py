@@ -155,6 +155,9 @@ class Comparison:
         return bool(np.max(np.abs(value - other), initial=0.0) <= self.tolerance * largest)
 
 
+EXACT = Comparison(None)
+
+
 def ulps_apart(a: Array, b: Array) -> int | None:
     """The most floating-point numbers between two entries of arrays; None if they are of different shapes."""
     if a.shape != b.shape:

@@ -371,12 +371,14 @@ def _unit_inverse(unit: Array) -> Array:
     except np.linalg.LinAlgError:
         regular = False
     if regular:
-        root: Array = np.linalg.solve(lower, np.eye(unit.shape[-1]))
-        return root.transpose(0, 2, 1) @ root
+        root = np.linalg.solve(lower, np.eye(unit.shape[-1]))
+        inverse: Array = root.transpose(0, 2, 1) @ root
+        return inverse
     values, vectors = np.linalg.eigh(unit)
     kept = values > SMALLEST_PIVOT
-    scaled: Array = vectors * (kept / np.where(kept, values, 1.0))[:, None, :]
-    return scaled @ vectors.transpose(0, 2, 1)
+    weighted: Array = vectors * (kept / np.where(kept, values, 1.0))[:, None, :]
+    pseudo: Array = weighted @ vectors.transpose(0, 2, 1)
+    return pseudo
 
 
 def _settled(layout: Layout, before: State, P: Array, Pi: Array) -> bool:

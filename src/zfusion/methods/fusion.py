@@ -75,4 +75,5 @@ def _pseudo_inverse(Z: Array, reference: Array) -> Array:
     values, vectors = np.linalg.eigh(Z * scales)
     kept = values > SMALLEST_EIGENVALUE
     scaled: Array = vectors * (kept / np.where(kept, values, 1.0))[..., None, :]
-    return (scaled @ vectors.swapaxes(-1, -2)) * scales
+    pseudo: Array = scaled @ vectors.swapaxes(-1, -2) * scales
+    return pseudo

@@ -9,8 +9,7 @@ exact. Deterministic: the same ledger at the same steps gives the same states, b
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,12 +19,18 @@ from zfusion.model.types import Array, NodeId
 from zfusion.used_sets import Ledger, UsedSet
 
 WINDOW = 64
-"""Past steps whose states are kept. A used set that becomes known within it costs as many steps of covariance work as it is
-late; beyond it the node goes back to the state it put aside when the gap began."""
+"""Past steps whose states are kept. A used set that becomes known within it costs as many steps of covariance work as
+it is late; beyond it the node goes back to the state it put aside when the gap began."""
 
-CATCH_UP = 256
-"""Steps of covariance work that a node does at most within one step to catch up after a longer gap: tens of
-milliseconds, so that it keeps its own deadlines meanwhile."""
+WINDOW_BYTES = 1 << 26
+"""What those states may take: a hub of 32 nodes keeps fewer of them."""
+
+CATCH_UP = 2048
+"""Work that a node does at most within one step to catch up after a longer gap, in steps of settled covariances: tens
+of milliseconds, so that it keeps its own deadlines meanwhile."""
+
+UNSETTLED = 16
+"""What a step costs whose covariances have to be computed, in steps of settled ones."""
 
 MASKS = 1024
 """Combinations of used sets whose masks are remembered."""
@@ -50,12 +55,10 @@ class StepModels:
             return found
         if step < self._next:
             self._iterator, self._kept, self._next = self._start(), {}, 1
-        for number, item in zip(
-            range(self._next, step + 1), islice(self._iterator, step + 1 - self._next), strict=True
-        ):
-            self._kept[number] = item
-            self._kept.pop(number - WINDOW - 2, None)
-        self._next = step + 1
+        while self._next <= step:
+            self._kept[self._next] = next(self._iterator)
+            self._kept.pop(self._next - WINDOW - 2, None)
+            self._next += 1
         return self._kept[step]
 
 
@@ -74,7 +77,7 @@ class Neighbourhood:
     def __init__(
         self,
         node: NodeId,
-        neighbourhoods: Mapping[NodeId, tuple[NodeId, ...]],
+        neighbourhoods: Mapping[NodeId, Collection[NodeId]],
         sizes: Mapping[NodeId, int],
         statistics: Statistics,
         initial: PriorMoments,
@@ -82,23 +85,29 @@ class Neighbourhood:
         """`neighbourhoods` are those of all l in N_i, `sizes` those of all sensors in them."""
         self._layout = Layout.build(neighbourhoods, sizes)
         self._nodes = self._layout.nodes
-        self._own = self._nodes.index(node)
+        self._row = {node: row for row, node in enumerate(self._nodes)}
+        self._own = self._row[node]
         self._initial = initial
         self._models = StepModels(statistics)
         start = Tracked(0, prior(self._layout, initial.covariance), (True,) * len(self._nodes))
         self._head = start
         self._recent: dict[int, Tracked] = {0: start}
+        """The last states up to the head, in ascending order of their steps."""
         self._aside: dict[int, Tracked] = {}
+        """For each row that is not exact at the head: the last state at which it was."""
+        self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
         self._masks: dict[tuple[UsedSet | None, ...], Bools] = {}
 
     def follow(self, step: int, ledger: Ledger) -> None:
-        """Bring the states up to `step` with all that the ledger knows."""
+        """Bring the states up to `step` with all that the ledger knows, or nearer to it after a long gap."""
         for node, changed in ledger.take_changes().items():
-            self._go_back(self._nodes.index(node), changed, ledger)
+            row = self._row.get(node)
+            if row is not None and changed <= self._head.step:
+                self._go_back(row, changed, ledger)
         budget = CATCH_UP
-        while self._head.step < step and budget:
+        while self._head.step < step and budget > 0 and self._is_worth_it(step, ledger):
             following = self._following(self._head, ledger)
-            budget -= following.state is not self._head.state
+            budget -= 1 if following.state is self._head.state else UNSETTLED
             self._keep(following)
 
     def exact(self, step: int) -> frozenset[NodeId]:
@@ -109,39 +118,47 @@ class Neighbourhood:
 
     def missing(self, node: NodeId, step: int, ledger: Ledger) -> int | None:
         """The first step up to `step` whose used set of `node` is needed and not known; None where all is known."""
-        history = ledger.of(node)
-        aside = self._aside.get(self._nodes.index(node))
-        start = aside.step + 1 if aside is not None else step
-        return start if history is None else history.first_unknown(start, step)
+        row, history = self._row[node], ledger.of(node)
+        base = self._head if self._head.exact[row] else self._aside.get(row)
+        if history is None or base is None:
+            return None
+        return history.first_unknown(base.step + 1, step)
 
     def blocks(self, others: Collection[NodeId]) -> tuple[Array, Array, Array]:
         """P^(ii) (nx, nx), P^(ij) (d, nx, nx) and P^(jl) (d, d, nx, nx) for the sorted `others`, at the newest step."""
-        chosen = [self._own, *(self._nodes.index(node) for node in others)]
+        chosen = [self._own, *(self._row[node] for node in others)]
         P = self._head.state.P[np.array(chosen)[:, None], :, self._layout.places(chosen)]
         return P[0, 0], P[0, 1:], P[1:, 1:]
 
     def moments(self, step: int) -> PriorMoments:
         """Mean and covariance of the state at `step`, before any measurement."""
-        return self._models.at(step)[1]
+        return self._models.at(step)[1] if step else self._initial
 
     @property
     def state(self) -> State:
         """The newest state: the same object while nothing has changed."""
         return self._head.state
 
+    def _is_worth_it(self, step: int, ledger: Ledger) -> bool:
+        """Whether any neighbour can be followed up to `step`: if none can, there is nothing to fuse."""
+        return any(
+            row != self._own
+            and (history := ledger.of(node)) is not None
+            and (self._head.exact[row] or history.born > self._head.step)
+            and history.first_unknown(self._head.step + 1, step) is None
+            for node, row in self._row.items()
+        )
+
     def _following(self, head: Tracked, ledger: Ledger) -> Tracked:
         """The next step after `head`, with the used sets that are known and none where they are not."""
         step = head.step + 1
         histories = [ledger.of(node) for node in self._nodes]
-        begins = [step > 1 and h is not None and h.born == step for h in histories]
+        used = tuple(None if h is None or step < h.born else h.at(step) for h in histories)
+        begins = [h is not None and h.born == step > 1 for h in histories]
         state = head.state
         if any(begins):
-            covariance = (self.moments(head.step) if head.step else self._initial).covariance
-            state = forget(self._layout, state, np.flatnonzero(begins).tolist(), covariance)
-        used = tuple(None if h is None else h.at(step) for h in histories)
-        exact = tuple(
-            (known or begin) and of is not None for known, begin, of in zip(head.exact, begins, used, strict=True)
-        )
+            state = forget(self._layout, state, np.flatnonzero(begins).tolist(), self.moments(head.step).covariance)
+        exact = tuple((known or new) and u is not None for known, new, u in zip(head.exact, begins, used, strict=True))
         return Tracked(step, advance(self._layout, state, self._models.at(step)[0], self._mask(used)), exact)
 
     def _mask(self, used: tuple[UsedSet | None, ...]) -> Bools:
@@ -154,31 +171,36 @@ class Neighbourhood:
         return mask
 
     def _keep(self, following: Tracked) -> None:
-        for row, (before, after) in enumerate(zip(self._head.exact, following.exact, strict=True)):
-            if before and not after:
-                self._aside[row] = self._head
-            elif after:
-                self._aside.pop(row, None)
+        if following.exact != self._head.exact:
+            for row, (before, after) in enumerate(zip(self._head.exact, following.exact, strict=True)):
+                if before and not after:
+                    self._aside[row] = self._head
+                elif after:
+                    self._aside.pop(row, None)
         self._head = self._recent[following.step] = following
-        self._recent.pop(following.step - WINDOW, None)
+        self._recent.pop(following.step - self._window, None)
 
     def _go_back(self, row: int, changed: int, ledger: Ledger) -> None:
-        """Begin again before `changed`, from the newest state that this row can be followed from, if there is one."""
+        """Go back before `changed`, to the newest state from which this row can be followed up to the head."""
         history = ledger.of(self._nodes[row])
-        if history is None or changed > self._head.step:
+        assert history is not None  # something has changed in it
+        right = (t for t in reversed(self._recent.values()) if t.exact[row] or history.born > t.step)
+        base = next((t for t in right if t.step < changed), self._aside.get(row))
+        if base is None or history.first_unknown(base.step + 1, self._head.step) is not None:
+            self._distrust(row, changed, base)
             return
-        base = next(
-            (
-                kept
-                for kept in reversed(self._recent.values())
-                if kept.step < changed and (kept.exact[row] or history.born > kept.step)
-            ),
-            self._aside.get(row),
-        )
-        if base is None or history.first_unknown(base.step + 1, changed) is not None:
+        self._recent = {step: kept for step, kept in self._recent.items() if step < base.step}
+        self._recent[base.step] = self._head = base
+        self._aside = {r: kept for r, kept in self._aside.items() if not base.exact[r] and kept.step < base.step}
+
+    def _distrust(self, row: int, changed: int, base: Tracked | None) -> None:
+        """The states from `changed` on are not right for this row, whatever they seemed; that of `base` still is."""
+        if not self._head.exact[row]:
             return
-        for later in [step for step in self._recent if step > base.step]:
-            del self._recent[later]
-        if base.step not in self._recent:
-            self._recent = {base.step: base}
-        self._head = base
+        for step, kept in self._recent.items():
+            if step >= changed:
+                exact = tuple(known and r != row for r, known in enumerate(kept.exact))
+                self._recent[step] = replace(kept, exact=exact)
+        self._head = self._recent[self._head.step]
+        if base is not None:
+            self._aside[row] = base

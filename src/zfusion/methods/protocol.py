@@ -64,5 +64,8 @@ class Method(Protocol):
     def begin(self, step: int, y: Array | None) -> Fields:
         """Fields of the first stage, from the own measurement (ny,), None where the sensor had none."""
 
+    def skip(self, step: int) -> None:
+        """A step that the node slept through: nothing was used in it, and no estimate of it is told."""
+
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
         """Take in what arrived of a stage, the own message included; the next stage's fields, or the outcome."""

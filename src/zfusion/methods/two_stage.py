@@ -52,6 +52,10 @@ class Centralized:
         """The measurement, as it is."""
         return {"y": y}
 
+    def skip(self, step: int) -> None:
+        """Go through a step without measurements."""
+        self._filter.step(self._models.at(step)[0], {})
+
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
         """Filter with what arrived."""
         used = self._filter_step(step, arrived)

@@ -7,11 +7,8 @@ import tomllib
 from collections.abc import Sequence
 from math import floor
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
-
 from zfusion.errors import InputError, Problem, ScenarioError
 from zfusion.model.scenario import Scenario
 from zfusion.model.schema.base import Count, Natural, Positive, Spec
@@ -27,9 +24,9 @@ ROUND = "round"
 class Study(Spec):
     """Settings of the study; see examples/library.toml."""
 
-    train_fraction: Annotated[float, Field(strict=True, gt=0, lt=1)]
+    train_fraction: Positive
     """The part of the rounds, from the first on, that the model is identified from; the swarm runs on the rest."""
-    held_out: Annotated[tuple[Natural, ...], Field(min_length=1)]
+    held_out: tuple[Natural, ...]
     """Motes that are not in the swarm; it predicts them."""
     modes: Natural
     """Spatial modes beside the common temperature."""
@@ -52,6 +49,10 @@ def prepare(study: Study, data: str | Path, out: str | Path) -> Path:
 
     Raises InputError for data that are missing or do not fit the study.
     """
+    if study.train_fraction >= 1:
+        raise InputError(
+            f"train_fraction: expected less than 1, so that something is left to run on, not {study.train_fraction}"
+        )
     readings, links = load_readings(Path(data)), load_links(Path(data))
     strangers = sorted(set(study.held_out) - set(readings.motes))
     if strangers:
