@@ -117,6 +117,10 @@ class GapCounter:
         else:
             life.observe(seq)
 
+    def expects(self, born: int, seq: int) -> bool:
+        """Whether a message with these counters would be the next one in order."""
+        return born == self._born and seq == self._life.next
+
     def observe_unreadable(self) -> None:
         """A message came that has no legal counters."""
         self._unreadable += 1

@@ -116,8 +116,10 @@ class History:
         first = len(self._starts) - len(told)
         if first < 0:
             return False
-        last_runs = zip(told, self._starts[first:], self._sets[first:], strict=True)
-        return all(run[0] == start and run[1] == used for run, start, used in last_runs)
+        for run, start, used in zip(told, self._starts[first:], self._sets[first:], strict=True):
+            if run[0] != start or run[1] != used:
+                return False
+        return True
 
     def _append(self, step: int, used: UsedSet) -> None:
         if not self._sets or self._sets[-1] != used:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import cast
 
-from zfusion.drivers.metrics import Errors, Latencies, NodeReport, edge_report
+from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report
 from zfusion.drivers.sources import Source
 from zfusion.methods import METHODS, Setting
 from zfusion.model.network import Network
@@ -54,9 +54,9 @@ class Account:
         self.skipped = 0
         """Steps that it did not take because their time was over."""
         self._node, self._source = node, source
-        self._begun_ns = self._ended_ns = begun_ns
+        self._begun_ns = begun_ns
         self._errors: dict[str, Errors] = {}
-        self._latencies = Latencies()
+        self._paces = [Pace(begun_ns)]
 
     def compare(self, message: Message) -> None:
         """Set an estimate, of whatever stage, beside the truth, where that is known."""
@@ -68,27 +68,33 @@ class Account:
             errors = self._errors[message.stage] = Errors()
         errors.add(cast(Array, message.fields["x"]) - truth, cast("Array | None", message.fields.get("P")))
 
+    def settle(self, now_ns: int) -> None:
+        """From here on the pace is told apart, too: what a swarm does once it is warm."""
+        self._paces.append(Pace(now_ns))
+
     def complete(self, now_ns: int, latency_ns: int) -> None:
         """A step was completed, so long after its measurement."""
-        self._ended_ns = now_ns
-        self._latencies.add(latency_ns)
+        self._paces[-1].add(now_ns, latency_ns)
 
     def report(self) -> NodeReport:
         """What became of it all so far."""
-        node = self._node
+        node, latencies = self._node, Latencies()
+        for pace in self._paces:
+            latencies.merge(pace.latencies.sparse())
         return NodeReport(
             node=node.id,
             born=node.born,
             step=node.step,
             completed=node.completed,
             skipped=self.skipped,
-            elapsed_s=(self._ended_ns - self._begun_ns) / 1e9,
+            elapsed_s=(max(pace.ended_ns for pace in self._paces) - self._begun_ns) / 1e9,
             sent=dict(node.sent),
             edges=edge_report(node),
             fallbacks=node.fallbacks,
             errors={stage: errors.summary() for stage, errors in self._errors.items()},
-            latency={str(number): count for number, count in self._latencies.sparse().items()},
+            latency=latencies.told(),
             overheard=dict(self._source.counters),
+            settled=self._paces[-1].told() if len(self._paces) > 1 else {},
         )
 
     def last_words(self) -> dict[str, object]:

@@ -30,7 +30,7 @@ class KeySource:
 
     def __init__(self, session: zenoh.Session, node: NodeId, key: str, ny: int, wait_s: float) -> None:
         self.node = node
-        self.refused: Counter[str] = Counter()
+        self.counters: Counter[str] = Counter()
         """Messages that were no readings, by reason."""
         self._ny, self._wait_s = ny, wait_s
         self._newest: Array | None = None
@@ -57,7 +57,7 @@ class KeySource:
         try:
             reading = decode_reading(sample.payload.to_bytes(), str(sample.encoding).startswith(MSGPACK), self._ny)
         except MessageError as error:
-            self.refused[error.reason] += 1
+            self.counters[error.reason] += 1
             return
         with self._came:
             self._newest = reading

@@ -13,27 +13,31 @@ import gc
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from heapq import heappop, heappush
+from itertools import count
+from typing import Any
 
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.account import Account, make_node, truth_message
+from zfusion.drivers.endpoints import Endpoints, linked, links_of
 from zfusion.drivers.inbox import Inbox
+from zfusion.drivers.key_source import KeySource
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
-from zfusion.drivers.metrics import Errors, Latencies, NodeReport, edge_report
-from zfusion.drivers.sources import Source
-from zfusion.drivers.transport import Endpoints, on_zenoh_thread, open_session, publisher
-from zfusion.errors import InputError, MessageError, RunError
-from zfusion.messages import Decoder, encode
-from zfusion.methods import METHODS, Setting
-from zfusion.model.network import Network
+from zfusion.drivers.metrics import NodeReport
+from zfusion.drivers.sources import Source, open_source
+from zfusion.drivers.transport import on_zenoh_thread, open_session, publisher
+from zfusion.errors import InputError, MessageError
+from zfusion.messages import Decoder, Reason, decode_any, encode
+from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
-from zfusion.model.types import Array, NodeId
-from zfusion.node import Ask, Effect, Node, Patience
-from zfusion.stages import ESTIMATE, EVENT, TRUTH, TRUTH_SENDER, Message
+from zfusion.model.types import NodeId
+from zfusion.node import LOOKAHEAD, Ask, Effect, Node
+from zfusion.stages import ESTIMATE, EVENT, TRUTH, Message
 from zfusion.status import HistoryAnswer, Phase, Status
 
 log = logging.getLogger(__name__)
@@ -41,23 +45,32 @@ log = logging.getLogger(__name__)
 ANSWER_S = 2.0
 """How long a query may take; an answer is a few hundred bytes from a neighbour that is not busy for long."""
 
-LEAVE_S = 5.0
+LEAVE_NS = 5_000_000_000
 """How long a node stays after its last step for neighbours that do not confirm that they have its messages."""
+
+WORD_NS = 5_000_000_000
+"""How often a node that waits for others says for whom."""
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
 
-TOLD_RUNS = 512
-"""Runs of a history in one event: what an event may hold, with room to spare."""
+AHEAD = 65_536
+"""Messages kept here that are too far ahead for the node to take: what a swarm says in half a minute, while a node that
+was restarted follows it."""
+
+QUESTIONS = frozenset({"status?", "history?"})
+
+MAX_NOTICES = 4096
+"""Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""
+
+GARBAGE_THRESHOLD = 100_000
+"""Allocations between two garbage collections. A round makes no cycles; a collection costs as much as a round."""
 
 Channel = tuple[NodeId, str]
 """(neighbour, stage)."""
 
 RECORDER = "the recorder"
 """Stands for it among node ids."""
-
-GARBAGE_THRESHOLD = 100_000
-"""Allocations between two garbage collections. A round makes no cycles; a collection costs as much as a round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,80 +94,67 @@ class LiveNode:
         self,
         scenario: Scenario,
         node: NodeId,
-        source: Source,
         options: LiveOptions,
         tell: Callable[[Status], None] | None = None,
     ) -> None:
         """`tell` is called with the node's status a few times a second.
 
-        Raises InputError where Zenoh does not open.
+        Raises InputError where Zenoh does not open, or the sensor's source.
         """
         self.id = node
-        self._scenario, self._source, self._options, self._tell = scenario, source, options, tell
+        self._scenario, self._options, self._tell = scenario, options, tell
         self._method = METHODS[scenario.method.name]
         self._graph = self._method.network(scenario.network)
-        self._started_ns = time.time_ns()
         self._phase = Phase.JOINING
         self._node: Node | None = None
+        self._account: Account | None = None
         self._stopping = False
-        self._outstanding = 0
-        self._errors: dict[str, Errors] = {}
-        self._latencies = Latencies()
+        self._unconfirmed: set[NodeId] = set()
+        """Who has not said yet that it has this node's last messages."""
         self._overheard: Counter[str] = Counter()
         self._strangers: set[NodeId] = set()
-        self._skipped = 0
-        self._begun_ns = self._ended_ns = 0
-        self._truths = 0
+        self._decoders: dict[Channel, Decoder] = {}
+        self._ahead: list[tuple[int, int, Channel, bytes, Message]] = []
+        self._order = count()
+        self._last_heard: dict[Channel, bytes] = {}
+        self._estimates: list[Message] = []
         self._told_ns = 0
         self._meeting = self._make_meeting()
+        config = scenario.transport.zenoh_config
         self._session = open_session(
             options.endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
-            config_file=None if not scenario.transport.zenoh_config else scenario.absolute(scenario.transport.zenoh_config),
+            config_file=scenario.absolute(config) if config else None,
         )
+        try:
+            self._source: Source = open_source(scenario, node, self._subscribe)
+        except InputError:
+            self._session.close()
+            raise
         self._inbox = Inbox(self._session)
 
     def run(self) -> NodeReport:
         """Join, take the steps, leave; what became of it all.
 
-        Raises InputError where a neighbour runs another scenario or version.
+        Raises InputError where a neighbour runs another scenario or version, RunError where the source fails.
         """
-        try:
-            with self._session:
-                try:
-                    self._declare()
-                    start = self._join()
-                    if start is not None:
-                        self._take_steps(start)
-                        self._leave()
-                finally:
-                    self._inbox.close()
-        finally:
-            self._source.close()
-        return self.report()
+        with self._session:
+            try:
+                self._declare()
+                start = self._join()
+                if start is not None:
+                    node = self._begin(start)
+                    self._take_steps(node, start)
+                    self._leave(node)
+            finally:
+                self._inbox.close()
+                self._source.close()
+        return self._report()
 
     def stop(self) -> None:
         """End after what is being done now: at the latest at the next message or deadline."""
         self._stopping = True
         self._inbox.notify(None)
-
-    def report(self) -> NodeReport:
-        """What became of it all so far."""
-        node = self._node
-        return NodeReport(
-            node=self.id,
-            born=node.born if node else 0,
-            step=node.step if node else 0,
-            completed=node.completed if node else 0,
-            skipped=self._skipped,
-            elapsed_s=(self._ended_ns - self._begun_ns) / 1e9,
-            sent=dict(node.sent) if node else {},
-            edges=edge_report(node) if node else {},
-            fallbacks=node.fallbacks if node else 0,
-            errors={stage: errors.summary() for stage, errors in self._errors.items()},
-            latency={str(number): count for number, count in self._latencies.sparse().items()},
-            overheard=dict(self._overheard),
-        )
 
     def status(self) -> Status:
         """How the node is doing."""
@@ -171,17 +171,28 @@ class LiveNode:
             fallbacks=node.fallbacks if node else 0,
         )
 
+    def _report(self) -> NodeReport:
+        node, account = self._node, self._account
+        if node is None or account is None:
+            return NodeReport.of_nothing(self.id)
+        while self._ahead:
+            *_, message = heappop(self._ahead)
+            node.counters[message.node].refused["too_early"] += 1
+        report = account.report()
+        report.overheard = dict(Counter(report.overheard) + self._overheard)
+        return report
+
     def _make_meeting(self) -> Meeting:
-        graph, timing = self._graph, self._scenario.timing
-        links = links_of(self._scenario)
+        scenario, timing = self._scenario, self._scenario.timing
+        links = links_of(scenario)
         swarm = connected(self.id, links)
         given = self._options.epoch_ns if self._options.epoch_ns is not None else timing.epoch_ns
         return Meeting(
             own=self.id,
-            identity=Status(self.id, self._scenario.fingerprint, Phase.JOINING, 0, 0, None, {}).identity,
-            started_ns=self._started_ns,
-            hears=frozenset(graph.neighbours(self.id)) - {self.id},
-            linked=frozenset(linked(self._scenario, self.id)),
+            identity=Status(self.id, scenario.fingerprint, Phase.JOINING, 0, 0, None, {}).identity,
+            started_ns=time.time_ns(),
+            hears=frozenset(self._graph.neighbours(self.id)) - {self.id},
+            linked=frozenset(linked(scenario, self.id)),
             swarm=swarm,
             hops=hops_from_smallest(swarm, links),
             needs_recorder=self._options.recorder,
@@ -190,41 +201,45 @@ class LiveNode:
             fixed_epoch=given is not None,
         )
 
+    def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
+        """The source of the readings that a program of the user's publishes."""
+        timing = self._scenario.timing
+        return KeySource(self._session, node, key, ny, 0.0 if timing.period_ns is not None else timing.timeout_s)
+
     def _declare(self) -> None:
         """Publishers, subscribers, queryables; the token last, so that whoever sees it is heard by this node."""
-        run, session = self._options.run, self._session
+        run, session, system = self._options.run, self._session, self._scenario.system()
         stages = [stage.name for stage in self._method.stages]
         published = (*stages, ESTIMATE.name, EVENT.name)
         self._publish = {stage: publisher(session, keys.stage_key(run, self.id, stage)).put for stage in published}
         self._tells_truth = self._scenario.truth_known and self.id == self._graph.ids[0]
         if self._tells_truth:
             self._publish[TRUTH.name] = publisher(session, keys.truth_key(run)).put
-        self._decoders: dict[Channel, Decoder] = {}
-        system = self._scenario.system()
-        for j in self._meeting.hears:
+        for j in sorted(self._meeting.hears, key=self._graph.ids.index):
             sizes = {"nx": system.nx, "ny": system.by_id[j].ny}
             for stage in self._method.stages:
                 self._decoders[j, stage.name] = Decoder(stage, j, sizes=sizes, ids=self._graph.neighbours(j))
                 self._inbox.subscribe((j, stage.name), keys.stage_key(run, j, stage.name))
+        liveliness = session.liveliness()
         self._kept = [
-            session.declare_queryable(keys.status_key(run, self.id), on_zenoh_thread(partial(self._note, "status?"))),
-            session.declare_queryable(keys.history_key(run, self.id), on_zenoh_thread(partial(self._note, "history?"))),
-            session.liveliness().declare_subscriber(
-                keys.node_token(run, "*"), on_zenoh_thread(partial(self._note, "token")), history=True
-            ),
-            session.liveliness().declare_subscriber(
-                keys.recorder_token(run), on_zenoh_thread(partial(self._note, "recorder")), history=True
-            ),
+            session.declare_queryable(keys.status_key(run, self.id), self._noting("status?")),
+            session.declare_queryable(keys.history_key(run, self.id), self._noting("history?")),
+            liveliness.declare_subscriber(keys.node_token(run, "*"), self._noting("token"), history=True),
+            liveliness.declare_subscriber(keys.recorder_token(run), self._noting("recorder"), history=True),
         ]
-        self._kept.append(session.liveliness().declare_token(keys.node_token(run, self.id)))
+        self._kept.append(liveliness.declare_token(keys.node_token(run, self.id)))
+
+    def _noting(self, kind: str) -> Any:
+        return on_zenoh_thread(partial(self._note, kind))
 
     def _note(self, kind: str, about: Any) -> None:
-        self._inbox.notify((kind, about))
+        if kind not in QUESTIONS or len(self._inbox.notices) < MAX_NOTICES:
+            self._inbox.notify((kind, about))
 
     def _join(self) -> Start | None:
         """Wait until it is time to begin; None if stopped before."""
-        next_poll = next_word = time.time_ns()
-        next_word += 5_000_000_000
+        next_poll = time.time_ns()
+        next_word = next_poll + WORD_NS
         while not self._stopping:
             self._handle_notices()
             now = time.time_ns()
@@ -234,87 +249,93 @@ class LiveNode:
             if now >= next_poll:
                 next_poll = now + POLL_NS
                 for j in self._meeting.present:
-                    self._query(keys.status_key(self._options.run, j), "status!", j)
+                    self._ask_status(j)
                 self._tell_status(now)
             if now >= next_word:
-                next_word = now + 5_000_000_000
+                next_word = now + WORD_NS
                 log.warning("waiting for %s", ", ".join(self._meeting.missing()))
             self._inbox.rest(next_poll)
         return None
 
-    def _take_steps(self, start: Start) -> None:
-        scenario, period = self._scenario, self._scenario.timing.period_ns
-        stages = [stage.name for stage in self._method.stages]
-        timing = scenario.timing
-        waits = tuple(timing.timeout_ns if period is None else timing.deadline_ns(stage) for stage in stages)
+    def _begin(self, start: Start) -> Node:
+        """Make the node, and say that it is there."""
         self._meeting.epoch_ns = start.epoch_ns
-        method = self._method(Setting(self.id, scenario.system(), self._graph, start.born))
-        neighbourhood = self._graph.neighbours(self.id)
-        node = self._node = Node(
-            self.id, neighbourhood, method, Patience(waits, period is not None), born=start.born, expected=start.expected
-        )
+        node = make_node(self._scenario, self._graph, self.id, born=start.born, expected=start.expected)
         for j in self._meeting.present & self._meeting.hears:
             node.back(j)
-        self._phase = Phase.RUNNING
         gc.collect()
         gc.freeze()
         gc.set_threshold(GARBAGE_THRESHOLD)
-        self._begun_ns = self._ended_ns = time.time_ns()
-        self._carry_out([node.event("started", self._begun_ns, epoch_ns=start.epoch_ns)])
+        now = time.time_ns()
+        self._node, self._account, self._phase = node, Account(node, self._source, now), Phase.RUNNING
+        self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
+        return node
+
+    def _take_steps(self, node: Node, start: Start) -> None:
+        """From the first step of this life to the last of the run, the second half of them counting as settled."""
+        account, period, last = self._account, self._scenario.timing.period_ns, self._options.steps
+        assert account is not None  # `_begin` has made it
+        middle = None if last is None else (start.born + last + 1) // 2
         step = start.born
-        while not self._stopping and (self._options.steps is None or step <= self._options.steps):
+        while not self._stopping and (last is None or step <= last):
             due = None
             if period is not None:
-                due = start.epoch_ns + step * period
-                step, due = self._await_step(step, due, period)
-                if self._stopping:
-                    break
-            self._take_step(node, step, due)
+                due = self._await_due(start.epoch_ns + step * period)
+                skipped = (time.time_ns() - due) // period  # its whole period is over
+                if skipped > 0 and not self._stopping:
+                    skipped = skipped if last is None else min(skipped, last + 1 - step)
+                    account.skipped += skipped
+                    step += skipped
+                    continue
+            if middle is not None and step >= middle:
+                middle = None
+                account.settle(time.time_ns())
+            self._take_step(node, account, step, due)
             step += 1
 
-    def _await_step(self, step: int, due: int, period: int) -> tuple[int, int]:
-        """Sleep until a paced step is due; if its whole period is over already, the step that is due now."""
+    def _await_due(self, due: int) -> int:
+        """Sleep until a paced step is due; then take what has come meanwhile."""
         while not self._stopping and not self._inbox.rest(due):
             self._handle_notices()
-        late = (time.time_ns() - due) // period
-        if late > 0:
-            self._skipped += late
-            step, due = step + late, due + late * period
         self._inbox.drain(self._decoders, self._take)
-        return step, due
+        return due
 
-    def _take_step(self, node: Node, step: int, due: int | None) -> None:
-        now = time.time_ns()
-        y = self._source.read(step, due if due is not None else now)
-        began = time.perf_counter_ns()
+    def _take_step(self, node: Node, account: Account, step: int, due: int | None) -> None:
+        if self._stopping:
+            return
+        y = self._source.read(step, time.time_ns() if due is None else due)
+        began, now = time.perf_counter_ns(), time.time_ns()
         if self._tells_truth:
-            self._tell_truth(step, now)
+            self._tell_truth(node, step, now)
         self._carry_out(node.begin(step, y, now, due))
+        if self._ahead:
+            self._catch_up(node)
         for j in node.silent:
             self._inbox.drain([channel for channel in self._decoders if channel[0] == j], self._take)
         while node.stage is not None and not self._stopping:
             self._await_message(node)
         if node.stage is None:
-            self._latencies.add(time.perf_counter_ns() - began)
-            self._ended_ns = time.time_ns()
-            if self._ended_ns - self._told_ns > REPORT_NS:
-                self._tell_status(self._ended_ns)
+            latency = time.perf_counter_ns() - began
+            now = time.time_ns()
+            account.complete(now, latency)
+            if now - self._told_ns > REPORT_NS:
+                self._tell_status(now)
+        for estimate in self._estimates:
+            account.compare(estimate)
+        self._estimates.clear()
 
     def _await_message(self, node: Node) -> None:
         """Wait for one message, the deadline or a notice, and act on it."""
-        if self._inbox.notices:
-            self._handle_notices()
-        awaiting, stage = node.awaiting, node.stage
-        if not awaiting or stage is None:
-            self._carry_out(node.tick(time.time_ns()))
-            return
-        channel = (awaiting[0], stage)
+        channel = (node.awaiting[0], node.stage)
         data = self._inbox.wait(channel, node.deadline)
         if data is not None:
             self._take(channel, data)
-        elif node.deadline is not None and time.time_ns() >= node.deadline:
-            # what stands in the channels has arrived in time: it was only not looked at yet
-            self._inbox.drain([(j, stage) for j in awaiting], self._take)
+            return
+        self._handle_notices()
+        overdue = node.deadline is not None and time.time_ns() >= node.deadline
+        # What stands in the channels has arrived in time, it was only not looked at yet; and none must run full.
+        self._inbox.drain(self._decoders, self._take)
+        if overdue:
             self._carry_out(node.tick(time.time_ns()))
 
     def _take(self, channel: Channel, data: bytes) -> None:
@@ -329,8 +350,19 @@ class LiveNode:
             return
         if channel[0] in self._strangers:
             node.counters[channel[0]].refused["other_scenario"] += 1
-            return
-        self._carry_out(node.receive(message, time.time_ns()))
+        elif message.step > node.step + LOOKAHEAD and len(self._ahead) < AHEAD:
+            heappush(self._ahead, (message.step, next(self._order), channel, data, message))
+        else:
+            if message.step >= node.step:
+                self._last_heard[channel] = data
+            self._carry_out(node.receive(message, time.time_ns()))
+
+    def _catch_up(self, node: Node) -> None:
+        """Feed the node what was too far ahead of it and is not any more."""
+        while self._ahead and self._ahead[0][0] <= node.step + LOOKAHEAD:
+            _, _, channel, data, message = heappop(self._ahead)
+            self._last_heard[channel] = data
+            self._carry_out(node.receive(message, time.time_ns()))
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
@@ -339,23 +371,14 @@ class LiveNode:
                 continue
             self._publish[effect.stage](encode(effect))
             if "x" in effect.fields:
-                self._compare(effect)
+                self._estimates.append(effect)
 
-    def _compare(self, message: Message) -> None:
-        """Set an estimate beside the truth, where that is known."""
-        truth = self._source.truth(message.step)
-        if truth is None:
-            return
-        errors = self._errors.get(message.stage)
-        if errors is None:
-            errors = self._errors[message.stage] = Errors()
-        errors.add(cast(Array, message.fields["x"]) - truth, cast("Array | None", message.fields.get("P")))
-
-    def _tell_truth(self, step: int, now: int) -> None:
+    def _tell_truth(self, node: Node, step: int, now: int) -> None:
         x = self._source.truth(step)
-        message = Message(TRUTH_SENDER, step, TRUTH.name, self._truths, 1, now, {"x": x})
-        self._truths += 1
-        self._publish[TRUTH.name](encode(message))
+        if x is not None:
+            message = truth_message(x, step, node.sent[TRUTH.name], now)._replace(born=node.born)
+            node.sent[TRUTH.name] += 1
+            self._publish[TRUTH.name](encode(message))
 
     def _query(self, key: str, kind: str, about: NodeId) -> None:
         """Ask; the answer comes as a notice."""
@@ -366,9 +389,12 @@ class LiveNode:
             consolidation=zenoh.ConsolidationMode.NONE,
         )
 
+    def _ask_status(self, node: NodeId) -> None:
+        self._query(keys.status_key(self._options.run, node), "status!", node)
+
     def _handle_notices(self) -> None:
         notices = self._inbox.notices
-        while notices:
+        for _ in range(len(notices)):
             notice = notices.popleft()
             if notice is None:
                 continue
@@ -379,7 +405,11 @@ class LiveNode:
                 self._overheard[error.reason] += 1
 
     def _on_token(self, sample: Any) -> None:
-        node = self._scenario.node_id(keys.parse_token(str(sample.key_expr)).node or "")
+        text = keys.parse_token(str(sample.key_expr)).node or ""
+        try:
+            node = self._scenario.node_id(text)
+        except KeyError:
+            raise MessageError(Reason.UNKNOWN_ID, f"a token of node {text!r}") from None
         if node not in self._meeting.linked:
             return
         if sample.kind == zenoh.SampleKind.DELETE:
@@ -387,30 +417,39 @@ class LiveNode:
             return
         self._meeting.came(node)
         if self._node is not None:
-            self._query(keys.status_key(self._options.run, node), "status!", node)
+            self._ask_status(node)
 
-    def _on_gone(self, node: NodeId) -> None:
-        self._meeting.went(node)
-        if self._node is None or node not in self._meeting.hears:
+    def _on_gone(self, j: NodeId) -> None:
+        self._meeting.went(j)
+        self._unconfirmed.discard(j)
+        if self._node is None or self._phase is not Phase.RUNNING or j not in self._meeting.hears:
             return
-        # its last messages may be waiting behind this notice
-        self._inbox.drain([channel for channel in self._decoders if channel[0] == node], self._take)
+        # Its last messages may be waiting behind this notice. They are told, for they may not have come to the recorder.
+        channels = [channel for channel in self._decoders if channel[0] == j]
+        self._inbox.drain(channels, self._take)
+        last = [decode_any(self._last_heard[channel]) for channel in channels if channel in self._last_heard]
         now = time.time_ns()
-        self._carry_out([self._node.event("gone", now, of=node), *self._node.gone(node, now)])
+        self._carry_out([self._node.event("gone", now, of=j, last=last), *self._node.gone(j, now)])
 
     def _on_recorder(self, sample: Any) -> None:
         self._meeting.recorder = sample.kind == zenoh.SampleKind.PUT
+        if not self._meeting.recorder:
+            self._unconfirmed.discard(RECORDER)
 
-    def _on_recorder_status(self, about: object) -> None:
-        """It is only waited for."""
+    def _on_recorder_status(self, about: tuple[NodeId, Any]) -> None:
+        if about[1].ok is not None:
+            self._unconfirmed.discard(RECORDER)
 
     def _on_status(self, about: tuple[NodeId, Any]) -> None:
-        reply = about[1].ok
+        j, reply = about[0], about[1].ok
         if reply is None:
+            if self._node is not None and j in self._meeting.present:
+                self._ask_status(j)  # it was busy
             return
         status = Status.decode(reply.payload.to_bytes())
-        if status.node != about[0]:
-            raise MessageError("wrong_node", f"{status.node} answers for {about[0]}")
+        if status.node != j:
+            raise MessageError(Reason.WRONG_NODE, f"{status.node} answers for {j}")
+        self._unconfirmed.discard(j)
         if self._node is None:
             self._meeting.answered(status)
             return
@@ -418,11 +457,11 @@ class LiveNode:
             check_identity(self.id, self._meeting.identity, status)
         except InputError as error:
             log.error("%s", error)
-            self._strangers.add(status.node)
+            self._strangers.add(j)
             return
-        self._strangers.discard(status.node)
-        if status.node in self._meeting.hears and status.phase is not Phase.DONE:
-            self._node.back(status.node)
+        self._strangers.discard(j)
+        if j in self._meeting.hears and j in self._meeting.present and status.phase is not Phase.DONE:
+            self._node.back(j)
 
     def _on_history(self, about: tuple[NodeId, Any]) -> None:
         of, reply = about[0], about[1].ok
@@ -456,69 +495,26 @@ class LiveNode:
         if self._tell is not None:
             self._tell(self.status())
 
-    def _leave(self) -> None:
+    def _leave(self, node: Node) -> None:
         """Tell how it went, and stay until everybody that listens has the last messages.
 
         An answer to a query that was put after the last message comes after that message has arrived: links keep
         the order.
         """
-        node = self._node
-        if node is None:
-            raise RunError("left before it had begun")
+        assert self._account is not None  # `_begin` has made it
         self._phase = Phase.DONE
-        self._carry_out([node.event("stopped", time.time_ns(), **self._last_words())])
-        run = self._options.run
-        waiting = {j for j in self._graph.listeners(self.id) if j in self._meeting.present}
-        for j in waiting:
-            self._query(keys.status_key(run, j), "status!", j)
+        self._carry_out([node.event("stopped", time.time_ns(), **self._account.last_words())])
+        for j in self._graph.listeners(self.id):
+            if j in self._meeting.present:
+                self._unconfirmed.add(j)
+                self._ask_status(j)
         if self._meeting.recorder:
-            waiting.add(RECORDER)
-            self._query(keys.recorder_status_key(run), "recorder!", RECORDER)
-        self._tell_status(time.time_ns())
-        end = time.time_ns() + int(LEAVE_S * 1e9)
-        while waiting and time.time_ns() < end:
-            answers = [about[0] for kind, about in filter(None, self._inbox.notices) if kind in {"status!", "recorder!"}]
+            self._unconfirmed.add(RECORDER)
+            self._query(keys.recorder_status_key(self._options.run), "recorder!", RECORDER)
+        now = time.time_ns()
+        self._tell_status(now)
+        end = now + LEAVE_NS
+        while self._unconfirmed and now < end:
+            self._inbox.rest(end)
             self._handle_notices()
-            waiting.difference_update(answers)
-            waiting &= self._meeting.present | ({RECORDER} if self._meeting.recorder else set())
-            if waiting:
-                self._inbox.rest(min(end, time.time_ns() + POLL_NS))
-
-    def _last_words(self) -> dict[str, object]:
-        report = self.report()
-        return {"sent": report.sent, "edges": report.edges, "completed": report.completed, "skipped": report.skipped}
-
-
-def links_of(scenario: Scenario) -> Sequence[tuple[NodeId, NodeId]]:
-    """The pairs of nodes that have a link: graph neighbours, or all, as the scenario says."""
-    graph = METHODS[scenario.method.name].network(scenario.network)
-    return Network.complete(graph.ids).links() if scenario.transport.mesh == "full" else graph.links()
-
-
-def linked(scenario: Scenario, node: NodeId) -> tuple[NodeId, ...]:
-    """The nodes that `node` has a link with."""
-    return tuple(a if b == node else b for a, b in links_of(scenario) if node in (a, b))
-
-
-def endpoints_of(
-    scenario: Scenario, node: NodeId, listen: Sequence[str] | None = None, connect: Sequence[str] | None = None
-) -> Endpoints:
-    """Where a node listens and whom it dials: what is given, and else what the scenario says.
-
-    Of two linked nodes the one with the larger id dials, so that there is one link. A user's own Zenoh configuration,
-    where the scenario names one, rules alone unless endpoints are given.
-    """
-    if scenario.transport.zenoh_config and not listen and not connect:
-        return Endpoints()
-    rank = {i: number for number, i in enumerate(scenario.ids)}
-    dialled = [scenario.endpoint(j) for j in linked(scenario, node) if rank[j] < rank[node]]
-    return Endpoints(tuple(listen or (scenario.endpoint(node),)), tuple(dialled if connect is None else connect))
-
-
-def recorder_endpoints(
-    scenario: Scenario, connect: Sequence[str] | None = None, listen: Sequence[str] | None = None
-) -> Endpoints:
-    """Whom the recorder dials: every node, for peers pass nothing on."""
-    if scenario.transport.zenoh_config and not listen and not connect:
-        return Endpoints()
-    return Endpoints(tuple(listen or ()), tuple(connect or [scenario.endpoint(i) for i in scenario.ids]))
+            now = time.time_ns()

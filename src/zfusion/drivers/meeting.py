@@ -126,8 +126,12 @@ class Meeting:
 def check_identity(own: NodeId, identity: tuple[str, int, str], status: Status) -> None:
     """InputError, with both sides, unless a neighbour runs the same scenario on the same version."""
     if status.identity != identity:
-        mine, theirs = (f"scenario {i[2][:12]} on zfusion {i[0]}, wire format {i[1]}" for i in (identity, status.identity))
-        raise InputError(f"node {status.node} runs {theirs}; this node, {own}, runs {mine}: they cannot be of one swarm")
+        mine, theirs = (
+            f"scenario {i[2][:12]} on zfusion {i[0]}, wire format {i[1]}" for i in (identity, status.identity)
+        )
+        raise InputError(
+            f"node {status.node} runs {theirs}; this node, {own}, runs {mine}: they cannot be of one swarm"
+        )
 
 
 def hops_from_smallest(swarm: Collection[NodeId], links: Collection[tuple[NodeId, NodeId]]) -> int:

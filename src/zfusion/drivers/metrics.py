@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from zfusion import keys
+from zfusion.errors import MessageError
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node
+from zfusion.recording.reader import Recording
 
 BINS_PER_OCTAVE = 32
 """Resolution of a latency: 2.2 %, finer than two runs agree."""
@@ -38,6 +43,10 @@ class Latencies:
         """The non-empty bins."""
         return {number: count for number, count in enumerate(self._counts) if count}
 
+    def told(self) -> dict[str, int]:
+        """The same with text as keys, as JSON has it."""
+        return {str(number): count for number, count in self.sparse().items()}
+
     def merge(self, counts: Mapping[int, int]) -> None:
         """Add what `sparse` of another gave."""
         for number, count in counts.items():
@@ -50,6 +59,31 @@ class Latencies:
             return None
         number = int(np.searchsorted(cumulative, q * cumulative[-1]))
         return round(LOWEST_US * math.exp2((number + 0.5) / BINS_PER_OCTAVE), 1)
+
+
+class Pace:
+    """How fast a node was from some time on."""
+
+    def __init__(self, begun_ns: int) -> None:
+        self.begun_ns = self.ended_ns = begun_ns
+        """`ended_ns`: when the last step was completed."""
+        self.completed = 0
+        self.latencies = Latencies()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Until the end of the last step."""
+        return (self.ended_ns - self.begun_ns) / 1e9
+
+    def add(self, ended_ns: int, latency_ns: int) -> None:
+        """A step was completed, so long after its measurement."""
+        self.ended_ns = ended_ns
+        self.completed += 1
+        self.latencies.add(latency_ns)
+
+    def told(self) -> dict[str, Any]:
+        """As plain data: completed, elapsed_s, latency as `Latencies.told`."""
+        return {"completed": self.completed, "elapsed_s": self.elapsed_s, "latency": self.latencies.told()}
 
 
 ERROR_BLOCK = 256
@@ -118,9 +152,22 @@ class NodeReport:
     fallbacks: int
     errors: dict[str, dict[str, float]]
     latency: dict[str, int]
-    """Measurement to estimate, as `Latencies.sparse`, keys as text."""
+    """Measurement to estimate, as `Latencies.told`."""
     overheard: dict[str, int] = field(default_factory=dict)
     """What was not a legal message, and other trouble, by reason."""
+    settled: dict[str, Any] = field(default_factory=dict)
+    """completed, elapsed_s and latency of the part of its life that counts as settled, where there is one."""
+
+    @classmethod
+    def of_nothing(cls, node: NodeId) -> NodeReport:
+        """Of a life that ended before its first step."""
+        return cls.cut_short(node, {"born": 0, "step": 0, "completed": 0})
+
+    @classmethod
+    def cut_short(cls, node: NodeId, status: Mapping[str, Any]) -> NodeReport:
+        """Of a life that ended without a report: what is known from the last `Status` that it told."""
+        born, step, completed = status["born"], status["step"], status["completed"]
+        return cls(node, born, step, completed, 0, 0.0, sent={}, edges={}, fallbacks=0, errors={}, latency={})
 
 
 def edge_report(node: Node) -> dict[str, dict[str, dict[str, int]]]:
@@ -141,3 +188,32 @@ def edge_report(node: Node) -> dict[str, dict[str, dict[str, int]]]:
             "refused": dict(counters.refused),
         }
     return report
+
+
+@dataclass(slots=True)
+class RecorderReport:
+    """What is on the file."""
+
+    path: str
+    messages: int = 0
+    recorded: dict[str, int] = field(default_factory=dict)
+    """By stage."""
+    by_key: dict[str, int] = field(default_factory=dict)
+    """By node and stage: ``1/measurement``."""
+    lost: dict[str, int] = field(default_factory=dict)
+    """By topic, where anything is missing that its sender sent."""
+    foreign: int = 0
+    """What came and is not on the file: on keys that are none of the scenario's, or larger than any message is."""
+
+    @classmethod
+    def of(cls, recording: Recording) -> RecorderReport:
+        """Of a recording that is there."""
+        report = cls(str(recording.path), recording.messages)
+        for topic, count in recording.topics.items():
+            with suppress(MessageError):
+                _, node, stage = keys.parse(topic)
+                report.recorded[stage] = report.recorded.get(stage, 0) + count
+                report.by_key[f"{node}/{stage}"] = count
+        accounts = recording.statistics or {}
+        report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
+        return report

@@ -9,20 +9,24 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
-from zfusion.drivers.transport import Endpoints, on_zenoh_thread, open_session
+from zfusion.drivers.metrics import RecorderReport
+from zfusion.drivers.transport import on_zenoh_thread, open_session
 from zfusion.errors import MessageError
-from zfusion.messages import decode_any, encode_any
+from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
+from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
+from zfusion.model.types import NodeId
 from zfusion.recording.writer import RecordingWriter
-from zfusion.stages import EVENT
+from zfusion.stages import ESTIMATE, EVENT, TRUTH, TRUTH_SENDER, Stage
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it the senders wait, and lose nothing."""
@@ -31,19 +35,14 @@ CHANNEL = "all"
 
 
 @dataclass(slots=True)
-class RecorderReport:
-    """What is on the file."""
+class _Topic:
+    """One key of the run."""
 
-    path: str
-    messages: int = 0
-    recorded: dict[str, int] = field(default_factory=dict)
-    """By stage."""
-    by_key: dict[str, int] = field(default_factory=dict)
-    """By node and stage: ``1/measurement``."""
-    lost: dict[str, int] = field(default_factory=dict)
-    """By topic, where anything is missing that its sender sent."""
-    foreign: int = 0
-    """Messages of the run on keys that are none of zfusion's."""
+    node: NodeId | None
+    """None for the truth."""
+    stage: Stage
+    recorded: int = 0
+    decoder: Decoder | None = None
 
 
 class Recorder:
@@ -60,9 +59,10 @@ class Recorder:
         tell: Callable[[RecorderReport], None] | None = None,
     ) -> None:
         """InputError where Zenoh does not open."""
-        self._run, self._writer, self._tell = run, writer, tell
+        self._scenario, self._run, self._writer, self._tell = scenario, run, writer, tell
         self._until_all_gone = until_all_gone
         self._ids = {str(i) for i in scenario.ids}
+        self._topics = _topics(scenario, run)
         self._flush_ns = round(scenario.recording.flush_interval_s * 1e9)
         self._seen: set[str] = set()
         self._present: set[str] = set()
@@ -77,6 +77,7 @@ class Recorder:
             config_file=scenario.absolute(config) if config else None,
         )
         self._inbox = Inbox(self._session)
+        writer.is_legal = self.is_legal
 
     def run(self) -> RecorderReport:
         """Record; the file is finished when this returns, whatever ends it. RunError when writing fails."""
@@ -124,26 +125,52 @@ class Recorder:
                 next_flush = now + self._flush_ns
                 writer.flush()
                 if self._tell is not None:
-                    self._tell(self._report)
+                    self._tell(self._count())
             if inbox.notices and self._handle_notices():
                 return
 
     def _write(self, sample: Any, now: int) -> None:
-        topic = str(sample.key_expr)
-        try:
-            _, node, stage = keys.parse(topic)
-        except MessageError:
-            self._report.foreign += topic != self._bell
+        key = str(sample.key_expr)
+        topic = self._topics.get(key)
+        payload = sample.payload
+        if topic is None or len(payload) > MAX_MESSAGE_BYTES:
+            self._report.foreign += key != self._bell
             return
-        data = sample.payload.to_bytes()
-        self._writer.write(topic, data, now)
+        data = payload.to_bytes()
+        self._writer.write(key, data, now)
+        topic.recorded += 1
+        if topic.stage is EVENT:
+            self._note_totals(key, data)
+
+    def is_legal(self, key: str, data: bytes) -> bool:
+        """Whether bytes are a message that the node whose key they came on can have sent."""
+        topic = self._topics[key]
+        if topic.decoder is None:
+            topic.decoder = self._decoder(topic)
+        try:
+            topic.decoder.decode(data)
+        except MessageError:
+            return False
+        return True
+
+    def _decoder(self, topic: _Topic) -> Decoder:
+        system = self._scenario.system()
+        if topic.node is None:
+            return Decoder(topic.stage, TRUTH_SENDER, sizes={"nx": system.nx})
+        graph = METHODS[self._scenario.method.name].network(self._scenario.network)
+        sizes = {"nx": system.nx, "ny": system.by_id[topic.node].ny}
+        return Decoder(topic.stage, topic.node, sizes=sizes, ids=graph.neighbours(topic.node))
+
+    def _count(self) -> RecorderReport:
+        """The report, brought up to date."""
         report = self._report
-        report.messages += 1
-        report.recorded[stage] = report.recorded.get(stage, 0) + 1
-        key = f"{node}/{stage}"
-        report.by_key[key] = report.by_key.get(key, 0) + 1
-        if stage == EVENT.name:
-            self._note_totals(topic, data)
+        report.recorded = {}
+        for topic in self._topics.values():
+            if topic.recorded:
+                report.recorded[topic.stage.name] = report.recorded.get(topic.stage.name, 0) + topic.recorded
+        report.by_key = {f"{t.node}/{t.stage.name}": t.recorded for t in self._topics.values() if t.recorded}
+        report.messages = sum(report.recorded.values())
+        return report
 
     def _note_totals(self, topic: str, data: bytes) -> None:
         """What a leaving node says that it has sent."""
@@ -159,12 +186,13 @@ class Recorder:
             return
         for stage, count in sent.items():
             if isinstance(count, int) and isinstance(stage, str):
-                self._sent[topic.removesuffix(EVENT.name) + stage][event["born"]] = count
+                key = keys.truth_key(self._run) if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
+                self._sent[key][event["born"]] = count
 
     def _handle_notices(self) -> bool:
         """Act on what happened; True when it is time to end."""
         notices = self._inbox.notices
-        while notices:
+        for _ in range(len(notices)):
             notice = notices.popleft()
             if notice is None:
                 continue
@@ -173,7 +201,7 @@ class Recorder:
                 self._on_token(about)
             else:
                 self._drain()  # the asker's messages are in the channel, before its question
-                about.reply(keys.recorder_status_key(self._run), encode_any({"messages": self._report.messages}))
+                about.reply(keys.recorder_status_key(self._run), encode_any({"messages": self._count().messages}))
         everybody_left = self._until_all_gone and self._seen == self._ids and not self._present
         if self._stopping or everybody_left:
             self._drain()
@@ -181,7 +209,11 @@ class Recorder:
         return False
 
     def _drain(self) -> None:
-        while (sample := self._inbox.poll_sample(CHANNEL)) is not None:
+        """Write what is there by now."""
+        for _ in range(CAPACITY):
+            sample = self._inbox.poll_sample(CHANNEL)
+            if sample is None:
+                return
             self._write(sample, time.time_ns())
 
     def _on_token(self, sample: Any) -> None:
@@ -198,5 +230,13 @@ class Recorder:
             self._present.discard(node)
 
     def _finish(self) -> None:
+        self._count()
         accounts = self._writer.finish(sent=self._sent, facts={"foreign": str(self._report.foreign)})
         self._report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
+
+
+def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:
+    """All keys that a run can have, by themselves."""
+    stages = (*METHODS[scenario.method.name].stages, ESTIMATE, EVENT)
+    topics = {keys.stage_key(run, i, stage.name): _Topic(i, stage) for i in scenario.ids for stage in stages}
+    return topics | {keys.truth_key(run): _Topic(None, TRUTH)}

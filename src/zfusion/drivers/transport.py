@@ -1,4 +1,4 @@
-"""Zenoh sessions as zfusion wants them. With `live` and `taps`, the only importers of zenoh.
+"""Zenoh sessions as zfusion wants them.
 
 Peers with explicit endpoints, no multicast, no gossip: a node is linked to whom its scenario names and to nobody else.
 A session is open at once, whether or not the others are there yet; links come up in the background as they appear, and
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ os.environ.setdefault(
 
 import zenoh
 
+from zfusion.drivers.endpoints import Endpoints
 from zfusion.errors import InputError
 
 RETRY = {"period_init_ms": 20, "period_max_ms": 1000, "period_increase_factor": 1.5}
@@ -33,16 +33,12 @@ BLOCK_US = 60_000_000
 """How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer
 is slower than we are, which is no reason to lose its messages."""
 
+MAX_RECEIVED = 16 << 20
+"""Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times what
+zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
+
 LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
 """About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
-
-
-@dataclass(frozen=True, slots=True)
-class Endpoints:
-    """Where a session listens and whom it dials, as Zenoh endpoints (``tcp/127.0.0.1:7450``)."""
-
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
 
 
 def open_session(
@@ -103,6 +99,7 @@ def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zeno
         "timestamping/enabled": True,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
+        "transport/link/rx/max_message_size": MAX_RECEIVED,
         "transport/shared_memory/enabled": False,
     }
     for key, value in (settings | (LOW_LATENCY if low_latency else {})).items():
@@ -117,3 +114,15 @@ def _listed(endpoints: Sequence[str]) -> str:
 def _reason(error: Exception) -> str:
     """Zenoh's own words, without the source positions that it adds."""
     return str(error).split(" at /")[0].strip()
+
+
+def republisher(session: zenoh.Session) -> Callable[[str, bytes], None]:
+    """A function that puts a payload on a key, with a publisher for each key that it is called with."""
+    publishers: dict[str, zenoh.Publisher] = {}
+
+    def put(key: str, data: bytes) -> None:
+        if key not in publishers:
+            publishers[key] = publisher(session, key)
+        publishers[key].put(data)
+
+    return put

@@ -56,6 +56,9 @@ SMALLEST_PIVOT = 1e-11
 
 Below it the covariance of the innovations is treated as the singular matrix that it is (`_inverse`)."""
 
+SMALLEST_VARIANCE = 1e-290
+"""A variance below this is zero: its inverse could not be represented."""
+
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
@@ -354,7 +357,7 @@ def _inverse(Pi: Array, used: Bools) -> Array:
     the pseudo-inverse, on the unit-diagonal scaling, with eigenvalues below SMALLEST_PIVOT taken as zero.
     """
     variance = Pi.diagonal(0, 1, 2)
-    counted = used & (variance > 0.0)
+    counted = used & (variance > SMALLEST_VARIANCE)
     scale = counted / np.sqrt(np.where(counted, variance, 1.0))
     scales = scale[:, :, None] * scale[:, None, :]
     unit = Pi * scales

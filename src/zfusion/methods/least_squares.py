@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from zfusion.methods.covariances import Bools, Layout, advance, prior
+from zfusion.methods.covariances import Gains, Layout, advance, prior
 from zfusion.model.statistics import StepModel
 from zfusion.model.types import Array, NodeId
 
@@ -23,25 +23,29 @@ from zfusion.model.types import Array, NodeId
 class LeastSquaresFilter:
     """The filter of one node, from its prior at step `born` - 1 on."""
 
-    def __init__(self, neighbourhood: Sequence[NodeId], sizes: Mapping[NodeId, int], mean: Array, covariance: Array):
+    def __init__(
+        self, neighbourhood: Sequence[NodeId], sizes: Mapping[NodeId, int], mean: Array, covariance: Array
+    ) -> None:
         """Start from the prior moments of step `born` - 1, (nx,) and (nx, nx)."""
         self._neighbourhood = tuple(neighbourhood)
         self._layout = Layout.build({0: self._neighbourhood}, {j: sizes[j] for j in self._neighbourhood})
         self._state = prior(self._layout, covariance)
-        self._x = mean
-        self._innovation = np.zeros(self._layout.slots.shape[1])
-        self._slots = self._layout.sensor[0]
         self._everything = self._layout.used({0: self._neighbourhood})
+        self._nx, self._size = len(mean), self._layout.slots.shape[1]
+        self._step: Array | None = None
+        """(x̂, μ)_k = step (x̂_{k-1}, μ_{k-1}, Z_k)."""
+        self._known = np.concatenate((mean, np.zeros(self._size)))
+        """(x̂, μ), (nx + size,)."""
 
     @property
     def x(self) -> Array:
         """x̂_{k/k}, (nx,)."""
-        return self._x
+        return self._known[: self._nx]
 
     @property
     def P(self) -> Array:
         """Covariance of its error, (nx, nx)."""
-        covariance: Array = self._state.P[0]
+        covariance: Array = self._state.P[0, :, 0]
         return covariance
 
     @property
@@ -51,20 +55,30 @@ class LeastSquaresFilter:
 
     def step(self, model: StepModel, measurements: Mapping[NodeId, Array]) -> None:
         """Go to the next step with the measurements that arrived, each (ny_j,); an empty mapping is legal."""
-        used, Z = self._gather(measurements)
-        self._state = advance(self._layout, self._state, model, used)
-        gains = self._state.gains
-        assert gains is not None  # advance has just set them
-        predicted = gains.F @ self._x + gains.WA[0] @ self._innovation
-        self._innovation = Z - gains.H[0] @ predicted - gains.T[0] @ self._innovation
-        self._x = predicted + gains.K[0] @ self._innovation
+        everything = len(measurements) == len(self._neighbourhood)
+        used = self._everything if everything else self._layout.used({0: measurements})
+        state = advance(self._layout, self._state, model, used)
+        if self._step is None or state is not self._state:
+            assert state.gains is not None  # advance has set them
+            self._state, self._step = state, _one_step(state.gains)
+        values = [measurements[j] for j in self._neighbourhood] if everything else [self._scattered(measurements)]
+        self._known = self._step @ np.concatenate((self._known, *values))
 
-    def _gather(self, measurements: Mapping[NodeId, Array]) -> tuple[Bools, Array]:
-        """Used slots, (1, size), and Z, (size,), zero where nothing was used."""
-        if len(measurements) == len(self._neighbourhood):
-            return self._everything, np.concatenate([measurements[j] for j in self._neighbourhood])
-        Z = np.zeros(len(self._slots))
+    def _scattered(self, measurements: Mapping[NodeId, Array]) -> Array:
+        """Z, (size,), zero where nothing was used."""
+        Z = np.zeros(self._size)
         for j, y in measurements.items():
-            first = self._slots.index(j)
+            first = self._layout.sensor[0].index(j)
             Z[first : first + len(y)] = y
-        return self._layout.used({0: measurements}), Z
+        return Z
+
+
+def _one_step(gains: Gains) -> Array:
+    """The three equations of a step as one matrix, (nx + size, nx + 2 size)."""
+    F, WA, H, T, K = gains.F, gains.WA[0], gains.H[0], gains.T[0], gains.K[0]
+    predicted = np.hstack((F, WA, np.zeros_like(K)))
+    innovation = -H @ predicted
+    nx, size = K.shape
+    innovation[:, nx : nx + size] -= T
+    innovation[:, nx + size :] = np.eye(size)
+    return np.vstack((predicted + K @ innovation, innovation))

@@ -9,7 +9,7 @@ exact. Deterministic: the same ledger at the same steps gives the same states, b
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,8 +62,7 @@ class StepModels:
         return self._kept[step]
 
 
-@dataclass(frozen=True, slots=True)
-class Tracked:
+class Tracked(NamedTuple):
     """A state of the recursion, the step it stands at, and for which nodes (by position) it is right."""
 
     step: int
@@ -86,7 +85,7 @@ class Neighbourhood:
         self._layout = Layout.build(neighbourhoods, sizes)
         self._nodes = self._layout.nodes
         self._row = {node: row for row, node in enumerate(self._nodes)}
-        self._own = self._row[node]
+        self._node = node
         self._initial = initial
         self._models = StepModels(statistics)
         start = Tracked(0, prior(self._layout, initial.covariance), (True,) * len(self._nodes))
@@ -112,9 +111,10 @@ class Neighbourhood:
 
     def exact(self, step: int) -> frozenset[NodeId]:
         """The nodes whose covariances at `step` are known; empty while still catching up."""
-        if self._head.step < step:
+        head = self._head
+        if head.step != step:
             return frozenset()
-        return frozenset(node for node, known in zip(self._nodes, self._head.exact, strict=True) if known)
+        return frozenset([node for node, known in zip(self._nodes, head.exact, strict=True) if known])
 
     def missing(self, node: NodeId, step: int, ledger: Ledger) -> int | None:
         """The first step up to `step` whose used set of `node` is needed and not known; None where all is known."""
@@ -126,7 +126,7 @@ class Neighbourhood:
 
     def blocks(self, others: Collection[NodeId]) -> tuple[Array, Array, Array]:
         """P^(ii) (nx, nx), P^(ij) (d, nx, nx) and P^(jl) (d, d, nx, nx) for the sorted `others`, at the newest step."""
-        chosen = [self._own, *(self._row[node] for node in others)]
+        chosen = [self._row[self._node], *(self._row[node] for node in others)]
         P = self._head.state.P[np.array(chosen)[:, None], :, self._layout.places(chosen)]
         return P[0, 0], P[0, 1:], P[1:, 1:]
 
@@ -141,24 +141,26 @@ class Neighbourhood:
 
     def _is_worth_it(self, step: int, ledger: Ledger) -> bool:
         """Whether any neighbour can be followed up to `step`: if none can, there is nothing to fuse."""
-        return any(
-            row != self._own
-            and (history := ledger.of(node)) is not None
-            and (self._head.exact[row] or history.born > self._head.step)
-            and history.first_unknown(self._head.step + 1, step) is None
-            for node, row in self._row.items()
-        )
+        reached = self._head.step
+        for node, known in zip(self._nodes, self._head.exact, strict=True):
+            history = ledger.of(node)
+            if history is None or node == self._node or not (known or history.born > reached):
+                continue
+            if history.first_unknown(reached + 1, step) is None:
+                return True
+        return False
 
     def _following(self, head: Tracked, ledger: Ledger) -> Tracked:
         """The next step after `head`, with the used sets that are known and none where they are not."""
         step = head.step + 1
         histories = [ledger.of(node) for node in self._nodes]
-        used = tuple(None if h is None or step < h.born else h.at(step) for h in histories)
-        begins = [h is not None and h.born == step > 1 for h in histories]
-        state = head.state
-        if any(begins):
-            state = forget(self._layout, state, np.flatnonzero(begins).tolist(), self.moments(head.step).covariance)
-        exact = tuple((known or new) and u is not None for known, new, u in zip(head.exact, begins, used, strict=True))
+        used = tuple([None if h is None or step < h.born else h.at(step) for h in histories])
+        begins = [row for row, h in enumerate(histories) if h is not None and h.born == step] if step > 1 else []
+        state, exact = head.state, head.exact
+        if begins:
+            state = forget(self._layout, state, begins, self.moments(head.step).covariance)
+        if begins or None in used:
+            exact = tuple([(known or row in begins) and used[row] is not None for row, known in enumerate(exact)])
         return Tracked(step, advance(self._layout, state, self._models.at(step)[0], self._mask(used)), exact)
 
     def _mask(self, used: tuple[UsedSet | None, ...]) -> Bools:
@@ -200,7 +202,7 @@ class Neighbourhood:
         for step, kept in self._recent.items():
             if step >= changed:
                 exact = tuple(known and r != row for r, known in enumerate(kept.exact))
-                self._recent[step] = replace(kept, exact=exact)
+                self._recent[step] = kept._replace(exact=exact)
         self._head = self._recent[self._head.step]
         if base is not None:
             self._aside[row] = base

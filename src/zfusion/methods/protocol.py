@@ -8,8 +8,9 @@ arrived, publishes the next stage, and so on, until `advance` of the last stage 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple, Protocol
 
 from zfusion.model.network import Network
 from zfusion.model.system import System
@@ -33,8 +34,7 @@ class Setting:
     """First step of this life; a node that was restarted begins later, from the prior, having used nothing before."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """A step's estimate."""
 
     x: Array
@@ -45,7 +45,7 @@ class Outcome:
     """Whose messages of the last stage went into it."""
     excluded: UsedSet = ()
     """Whose messages were there and had to be left out, because their history is not known (a *fallback*)."""
-    ask: Mapping[NodeId, int] = field(default_factory=dict)
+    ask: Mapping[NodeId, int] = MappingProxyType({})
     """Whose history is wanted, and from which step on."""
 
 

@@ -104,6 +104,7 @@ class TwoStage(Centralized):
             lambda: step_models(system, sensors),
             prior_moments(system),
         )
+        self._others = tuple(j for j in self._neighbourhood if j != self._node)
         self._weights: _Weights | None = None
 
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
@@ -113,12 +114,14 @@ class TwoStage(Centralized):
             return {"x": self._filter.x, "used": used}
         self._neighbours.follow(step, ledger)
         known = self._neighbours.exact(step)
-        others = [j for j in self._neighbourhood if j in arrived and j != self._node]
-        fused = tuple(j for j in others if j in known)
-        excluded = tuple(j for j in others if j not in known)
-        ask = {j: first for j in excluded if (first := self._neighbours.missing(j, step, ledger)) is not None}
+        others = tuple([j for j in self._others if j in arrived])
+        fused = tuple([j for j in others if j in known])
         x, P = self._fuse(step, fused, [cast(Array, arrived[j]["x"]) for j in fused])
-        used = tuple(j for j in self._neighbourhood if j == self._node or j in fused)
+        if len(fused) == len(self._others):
+            return Outcome(x, P, self._neighbourhood)
+        used = tuple([j for j in self._neighbourhood if j == self._node or j in fused])
+        excluded = tuple([j for j in others if j not in known])
+        ask = {j: first for j in excluded if (first := self._neighbours.missing(j, step, ledger)) is not None}
         return Outcome(x, P, used, excluded, ask)
 
     def _fuse(self, step: int, fused: UsedSet, estimates: list[Array]) -> tuple[Array, Array]:
@@ -130,7 +133,7 @@ class TwoStage(Centralized):
             own, cross, among = self._neighbours.blocks(fused)
             weights, covariance = fusion_weights(own, cross, among, prior.covariance)
             kept = self._weights = _Weights(self._neighbours.state, fused, prior, weights, covariance)
-        return fuse(self._filter.x, np.array(estimates), prior.mean, kept.weights), kept.covariance
+        return fuse(self._filter.x, estimates, prior.mean, kept.weights), kept.covariance
 
 
 @dataclass(frozen=True)

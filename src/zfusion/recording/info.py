@@ -8,8 +8,8 @@ from typing import Any
 
 from zfusion import keys
 from zfusion.errors import MessageError
-from zfusion.messages import read_stamp
 from zfusion.gaps import GapCounter, Gaps
+from zfusion.messages import read_stamp
 from zfusion.recording.layout import CHECKSUM
 from zfusion.recording.provenance import PACKAGES
 from zfusion.recording.reader import Recording

@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Metadata, Schema, Statistics
 
 from zfusion.errors import RecordingError
+from zfusion.gaps import Gaps
 from zfusion.recording import layout
 from zfusion.recording.container import (
     MAGIC,
@@ -34,7 +35,6 @@ from zfusion.recording.container import (
     read_at,
     unpack_chunk,
 )
-from zfusion.gaps import Gaps
 
 _EVER = 2**64
 """Later than every time that an MCAP file can say."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,9 +19,9 @@ from mcap.writer import Writer
 
 from zfusion import keys
 from zfusion.errors import MessageError, RecordingError, RunError
+from zfusion.gaps import GapCounter, Gaps
 from zfusion.messages import VERSION, json_schema, read_stamp
 from zfusion.recording import layout
-from zfusion.gaps import GapCounter, Gaps
 from zfusion.recording.provenance import clocks, machine, software
 from zfusion.stages import BUILT_IN, Stage
 
@@ -58,6 +58,8 @@ class RecordingWriter:
         stages: Iterable[Stage] = (),
         facts: Mapping[str, str] | None = None,
     ) -> None:
+        self.is_legal: Callable[[str, bytes], bool] = lambda _topic, _data: True
+        """Asked, with topic and payload, where a message's counters are not the next ones: what is not legal has none."""
         self.path = Path(path)
         self._stages = {stage.name: stage for stage in (*BUILT_IN, *stages)}
         self._schemas: dict[Stage | None, int] = {}
@@ -91,9 +93,11 @@ class RecordingWriter:
         log_time = self._log_time_ns = max(self._log_time_ns, arrival_ns)
         try:
             born, seq, t_ns = read_stamp(data)
-            channel.counter.observe(born, seq)
         except MessageError:
-            seq = t_ns = 0
+            born = seq = t_ns = 0
+        if born and (channel.counter.expects(born, seq) or self.is_legal(topic, data)):
+            channel.counter.observe(born, seq)
+        else:
             channel.counter.observe_unreadable()
         try:
             self._writer.add_message(channel.id, log_time, data, t_ns or log_time, seq & 0xFFFF_FFFF)

@@ -16,7 +16,9 @@ def show_info(console: Console, told: RecordingInfo) -> None:
     start = datetime.fromtimestamp(told.start_ns / 1e9, UTC)
     console.print(f"[bold]{told.run}[/]   {told.method}   seed {told.seed}")
     console.print(f"{told.messages} messages, {told.duration_ns / 1e9:.2f} s from {start:%Y-%m-%d %H:%M:%S} UTC")
-    console.print(f"{told.size_bytes} bytes, {'complete' if told.complete else 'broken off'}; {told.lost} messages lost")
+    console.print(
+        f"{told.size_bytes} bytes, {'complete' if told.complete else 'broken off'}; {told.lost} messages lost"
+    )
     if told.note:
         console.print(f"[yellow]{escape(told.note)}[/]")
     table = Table()

@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from zfusion.drivers.metrics import Latencies, NodeReport
-from zfusion.drivers.recorder import RecorderReport
+from zfusion.drivers.metrics import Latencies, NodeReport, RecorderReport
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.stages import ESTIMATE
@@ -99,7 +98,10 @@ def _edges(
             told = [report.edges[sender] for report in lives if sender in report.edges]
             senders_lives = by_text.get(sender, ())
             for stage in dict.fromkeys(s for edge in told for s in edge["heard"]):
-                count = {kind: sum(edge[kind].get(stage, 0) for edge in told) for kind in ("received", "late", "missed", "lost")}
+                count = {
+                    kind: sum(edge[kind].get(stage, 0) for edge in told)
+                    for kind in ("received", "late", "missed", "lost")
+                }
                 if to_the_end:
                     count["lost"] += _lost_at_the_end(stage, lives, senders_lives, sender)
                 yield Edge(
@@ -112,9 +114,7 @@ def _edges(
                 )
 
 
-def _lost_at_the_end(
-    stage: str, lives: Sequence[NodeReport], senders_lives: Sequence[NodeReport], sender: str
-) -> int:
+def _lost_at_the_end(stage: str, lives: Sequence[NodeReport], senders_lives: Sequence[NodeReport], sender: str) -> int:
     """What the sender put on its key after the last message that came, less what is of steps the receiver never took.
 
     Known only where both lived once: of a life that was cut short nobody told the totals.

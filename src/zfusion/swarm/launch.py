@@ -12,14 +12,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-from zfusion.drivers.live import linked
-from zfusion.drivers.metrics import NodeReport
-from zfusion.drivers.recorder import RecorderReport
+from zfusion.drivers.endpoints import dialled
+from zfusion.drivers.metrics import NodeReport, RecorderReport
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -37,7 +37,14 @@ MAX_RESTARTS = 10
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
 
-ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+PORTS = range(20_000, 32_000)
+"""Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them between
+our finding it free and the node's listening on it."""
+
+_tried = count(os.getpid() * 61)
+"""Two launchers begin at different places."""
+
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """A node's matrices are small: threads of a BLAS only get into each other's way, and the other nodes'."""
 
 
@@ -98,14 +105,20 @@ class Launcher:
     """One launch of a swarm."""
 
     def __init__(self, scenario: Scenario, options: LaunchOptions) -> None:
+        """InputError where the logs cannot be written."""
         self._scenario, self._options = scenario, options
         self._selector = selectors.DefaultSelector()
         self._failures: list[str] = []
         self._interrupts = 0
         self._stop_by: float | None = None
-        options.logs.mkdir(parents=True, exist_ok=True)
+        self._begun = False
+        """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
-        self._file.write_text(scenario.anchored().to_toml())
+        try:
+            options.logs.mkdir(parents=True, exist_ok=True)
+            self._file.write_text(scenario.anchored().to_toml())
+        except OSError as error:
+            raise InputError(f"{options.logs}: cannot be written: {error.strerror}") from None
         self._recorder, self._nodes = self._plan()
 
     def run(self) -> RunResult:
@@ -117,10 +130,12 @@ class Launcher:
         try:
             for child in self._everybody():
                 self._start(child)
-            self._watch()
+            self._watch_nodes()
+            self._kill(self._nodes.values())
             self._finish_recording()
         finally:
-            self._leave_nothing()
+            self._kill(self._everybody())
+            self._selector.close()
         return RunResult(
             run=self._options.run,
             scenario=self._scenario,
@@ -138,25 +153,22 @@ class Launcher:
 
     def _plan(self) -> tuple[Child | None, dict[NodeId, Child]]:
         scenario, options = self._scenario, self._options
-        ids = scenario.ids
-        endpoints = dict(zip(ids, free_endpoints(len(ids)), strict=True))
-        rank = {i: number for number, i in enumerate(ids)}
-        dials = {i: [endpoints[j] for j in linked(scenario, i) if rank[j] < rank[i]] for i in ids}
-        common = ["--run", options.run]
+        transport, common = scenario.transport, ["--run", options.run]
+        listens = dict(zip(scenario.ids, free_endpoints(len(scenario.ids)), strict=True)) | transport.endpoints
         base = [sys.executable, "-m", "zfusion"]
         nodes: dict[NodeId, Child] = {}
-        for i in ids:
-            command = [*base, "node", str(self._file), "--id", str(i), *common, "--listen", endpoints[i]]
-            for endpoint in dials[i]:
-                command += ["--connect", endpoint]
+        for i in scenario.ids:
+            command = [*base, "node", str(self._file), "--id", str(i), *common]
+            if not transport.zenoh_config:
+                command += ["--listen", listens[i], *_each("--connect", dialled(scenario, i, listens))]
             if options.recording is not None:
                 command.append("--await-recorder")
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log")
         recorder = None
         if options.recording is not None:
             command = [*base, "record", str(self._file), *common, "-o", str(options.recording)]
-            for endpoint in endpoints.values():
-                command += ["--connect", endpoint]
+            if not transport.zenoh_config:
+                command += _each("--connect", [listens[i] for i in scenario.ids])
             recorder = Child("the recorder", None, command, options.logs / "recorder.log")
         return recorder, nodes
 
@@ -177,11 +189,11 @@ class Launcher:
                 env={**os.environ, **ONE_THREAD},
             )
         line.child.close()
-        child.exit_code = None
+        child.exit_code, child.error, child.status = None, None, {}
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
-    def _watch(self) -> None:
-        """Until every node's process has ended for good."""
+    def _watch_nodes(self) -> None:
+        """Until every node's process has ended for good, or will not."""
         while any(child.running for child in self._nodes.values()):
             self._look_after_all()
             if self._interrupts and self._stop_by is None:
@@ -209,6 +221,7 @@ class Launcher:
         for message in child.line.messages():
             if "status" in message:
                 child.status = message["status"]
+                self._begun |= child.status.get("phase") in {"running", "done"}
             elif "report" in message:
                 child.reports.append(message["report"])
             elif "error" in message:
@@ -222,26 +235,31 @@ class Launcher:
         child.exit_code = code
         if code == 0:
             return
-        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        if child.error is not None:
-            how = child.error
-        begun = child.status.get("phase") in {"running", "done"} or child.node is None
-        where = f" at step {child.status['step']}" if child.status.get("step") else ""
-        message = f"{child.name} died{where}: {how}"
-        restarting = (
-            self._options.restart and child.node is not None and begun and self._stop_by is None
-            and child.restarts < MAX_RESTARTS
+        if child.node is not None and child.status:
+            child.reports.append(asdict(NodeReport.cut_short(child.node, child.status)))
+        message = f"{child.name} died{_step(child)}: {_cause(child, code)}"
+        restarting = self._may_restart(child)
+        self._options.on_message(
+            f"{message}{'; starting it again' if restarting else ''}\n{self._tail(child)}".rstrip()
         )
-        self._options.on_message(f"{message}{'; starting it again' if restarting else ''}\n{self._tail(child)}".rstrip())
         if restarting:
             child.restarts += 1
             self._start(child)
             return
         self._failures.append(message)
-        if not begun or child.node is None:
-            self._stop_nodes()  # a swarm without this node never begins; one without its recorder is not recorded
+        if child.node is None or not self._begun:
+            self._stop_nodes()  # a swarm without its recorder is not recorded; one without this node never begins
             if code == InputError.exit_code and child.error is not None:
                 raise InputError(f"{child.name}: {child.error}")
+
+    def _may_restart(self, child: Child) -> bool:
+        return (
+            self._options.restart
+            and child.node is not None
+            and self._begun
+            and self._stop_by is None
+            and child.restarts < MAX_RESTARTS
+        )
 
     def _tail(self, child: Child) -> str:
         lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
@@ -254,39 +272,59 @@ class Launcher:
                 child.line.stop()
 
     def _finish_recording(self) -> None:
-        child = self._recorder
-        if child is None or not child.running or child.process is None or child.line is None:
+        child, end = self._recorder, time.monotonic() + STOP_S
+        if child is None or not child.running or child.line is None:
             return
         child.line.stop()
-        try:
-            code = child.process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
+        while child.running and time.monotonic() < end:
+            self._look_after_all()
+        if child.running:
             self._failures.append(f"the recorder: did not finish within {STOP_S:g} s and had to be killed")
-            return
-        self._on_end(child, code)
 
     def _recorder_report(self) -> RecorderReport | None:
         if self._recorder is None or not self._recorder.reports:
             return None
         return RecorderReport(**self._recorder.reports[-1])
 
-    def _leave_nothing(self) -> None:
-        for child in self._everybody():
-            if child.process is not None and child.process.poll() is None:
+    def _kill(self, children: Collection[Child]) -> None:
+        """End what has not ended yet."""
+        for child in children:
+            if child.running and child.process is not None and child.line is not None:
                 child.process.kill()
-                child.process.wait()
-            if child.line is not None:
+                child.exit_code = child.process.wait()
+                self._selector.unregister(child.line.socket)
                 child.line.close()
-        self._selector.close()
 
 
-def free_endpoints(count: int) -> list[str]:
-    """Endpoints on the loopback interface that nobody listens on now."""
-    sockets = [socket.socket() for _ in range(count)]
+def free_endpoints(number: int) -> list[str]:
+    """Endpoints on the loopback interface that nobody listens on now. InputError if there are not so many."""
+    sockets: list[socket.socket] = []
     try:
-        for s in sockets:
-            s.bind(("127.0.0.1", 0))
+        for _ in PORTS:
+            if len(sockets) == number:
+                break
+            sockets.append(socket.socket())
+            try:
+                sockets[-1].bind(("127.0.0.1", PORTS[next(_tried) % len(PORTS)]))
+            except OSError:
+                sockets.pop().close()
+        if len(sockets) < number:
+            raise InputError(f"there are not {number} free ports between {PORTS.start} and {PORTS.stop}")
         return [f"tcp/127.0.0.1:{s.getsockname()[1]}" for s in sockets]
     finally:
         for s in sockets:
             s.close()
+
+
+def _each(option: str, values: Collection[str]) -> list[str]:
+    return [word for value in values for word in (option, value)]
+
+
+def _step(child: Child) -> str:
+    return f" at step {child.status['step']}" if child.status.get("step") else ""
+
+
+def _cause(child: Child, code: int) -> str:
+    if child.error is not None:
+        return child.error
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

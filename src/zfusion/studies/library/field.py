@@ -61,17 +61,28 @@ class FieldModel:
         expected: Array = x @ self.H[mote] + self.offset[mote]
         return expected
 
+    def variance(self, mote: int, P: Array) -> Array:
+        """How uncertain that is where the states' errors have covariances P, (..., nx, nx) -> (...)."""
+        variance: Array = P @ self.H[mote] @ self.H[mote]
+        return variance
+
 
 def identify(readings: Readings, members: Sequence[int], modes: int, rounds: int) -> FieldModel:
     """The model of the first `rounds` rounds, with `modes` spatial modes; deterministic.
 
-    InputError where the training is too short for it, or `modes` are more than the motes allow.
+    InputError where the training is too short, a mote hardly in it, or `modes` are more than the motes allow.
     """
     if rounds < MIN_TRAINING:
         raise InputError(f"a training of {rounds} rounds: expected at least {MIN_TRAINING}")
     if modes > len(readings.motes) - 2:
         raise InputError(f"{modes} spatial modes: expected at most {len(readings.motes) - 2}, two less than motes")
-    filled = without_gaps(readings.celsius[:rounds])
+    training = readings.celsius[:rounds]
+    for mote, count in zip(readings.motes, (~np.isnan(training)).sum(axis=0), strict=True):
+        if count < rounds / 2:
+            raise InputError(
+                f"mote {mote} has {count} readings in a training of {rounds} rounds: expected at least half"
+            )
+    filled = without_gaps(training)
     mean = filled.mean(axis=0)
     loadings, scores = principal_components(filled - mean, 1 + modes)
     residuals = filled - mean - scores @ loadings.T
@@ -101,14 +112,11 @@ def _row(mote: int, loadings: Array, members: Sequence[int]) -> Array:
 
 
 def without_gaps(values: Array) -> Array:
-    """Missing entries of each column interpolated in time; InputError for a column with less than two entries."""
+    """Missing entries of each column interpolated in time; a column must have some."""
     filled = values.copy()
     for column in filled.T:
-        there = np.flatnonzero(~np.isnan(column))
-        if len(there) < 2:
-            raise InputError("a mote without readings in the training")
-        gaps = np.flatnonzero(np.isnan(column))
-        column[gaps] = np.interp(gaps, there, column[there])
+        missing = np.isnan(column)
+        column[missing] = np.interp(np.flatnonzero(missing), np.flatnonzero(~missing), column[~missing])
     return filled
 
 

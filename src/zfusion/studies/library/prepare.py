@@ -9,6 +9,7 @@ from math import floor
 from pathlib import Path
 
 import numpy as np
+
 from zfusion.errors import InputError, Problem, ScenarioError
 from zfusion.model.scenario import Scenario
 from zfusion.model.schema.base import Count, Natural, Positive, Spec

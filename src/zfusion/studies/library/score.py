@@ -6,11 +6,11 @@ identified again, and must be the one that the recorded scenario has.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from rich.console import Console
@@ -36,7 +36,7 @@ SAME = 1e-6
 NEXT_COLUMNS = {"swarm": "swarm", "alone": "alone", "last value": "last", "mean of motes": "mean"}
 HELD_OUT_COLUMNS = {
     "swarm": "swarm",
-    "best node": "best",
+    "all nodes": "nodes",
     "worst node": "worst",
     "alone": "alone",
     "mean of motes": "mean",
@@ -71,11 +71,11 @@ class HeldOut:
     mote: int
     rounds: int
     swarm: float
-    """By the estimates of the swarm's nodes: over all rounds and nodes."""
-    best: float
-    """Of the node that did best."""
+    """By the estimate, in each round, of the node that was most certain: by its predicted error covariance."""
+    nodes: float
+    """By the estimates of all nodes: over all rounds and nodes."""
     worst: float
-    """Of the node that did worst."""
+    """By those of the node that did worst."""
     alone: float
     """By the same model at each mote from its own readings only: over all rounds and motes."""
     mean: float
@@ -121,7 +121,7 @@ def score(recording: str | Path, data: str | Path) -> Score:
         model = identify(readings, members, scenario.system().nx - 2 - len(members), training)
         _check_same(model, scenario, recording)
         estimates = _estimates(opened, scenario)
-    rounds = estimates.shape[1]
+    rounds = estimates.x.shape[1]
     part = readings.celsius[training : training + rounds]
     tested = _Tested(model, Readings(readings.motes, readings.celsius[:training]), Readings(readings.motes, part))
     alone = np.stack([_alone(scenario, mote, tested.after.of([mote])[:, 0]) for mote in members])
@@ -131,7 +131,7 @@ def score(recording: str | Path, data: str | Path) -> Score:
         method=opened.metadata.get("method", scenario.method.name),
         training=training,
         rounds=rounds,
-        next_reading=tuple(tested.next_reading(m, x, y) for m, x, y in zip(members, estimates, alone, strict=True)),
+        next_reading=tuple(tested.next_reading(m, x, y) for m, x, y in zip(members, estimates.x, alone, strict=True)),
         held_out=tuple(tested.held_out(mote, estimates, alone) for mote in held_out),
     )
 
@@ -155,26 +155,38 @@ def _check_same(model: FieldModel, scenario: Scenario, recording: str | Path) ->
             raise InputError(f"{recording}: its model is not the one that is identified from these data")
 
 
-def _estimates(recording: Recording, scenario: Scenario) -> Array:
-    """The recorded estimates, (members, rounds, nx); NaN where there is none. InputError if there are none at all."""
+class _Estimates(NamedTuple):
+    """What the nodes estimated; NaN where there is nothing."""
+
+    x: Array
+    """(members, rounds, nx)."""
+    P: Array
+    """(members, rounds, nx, nx)."""
+
+
+def _estimates(recording: Recording, scenario: Scenario) -> _Estimates:
+    """The recorded estimates; InputError if there are none."""
     nx, ids = scenario.system().nx, scenario.ids
     by_step = [_by_step(recording, i, Decoder(ESTIMATE, i, sizes={"nx": nx}, ids=ids)) for i in ids]
     rounds = max(max(found, default=0) for found in by_step)
     if not rounds:
         raise InputError(f"{recording.path}: holds no estimates")
-    nothing = np.full(nx, np.nan)
-    return np.array([[found.get(step, nothing) for step in range(1, rounds + 1)] for found in by_step])
+    x, P = np.full((len(ids), rounds, nx), np.nan), np.full((len(ids), rounds, nx, nx), np.nan)
+    for row, found in enumerate(by_step):
+        for step, fields in found.items():
+            x[row, step - 1], P[row, step - 1] = cast(Array, fields["x"]), cast(Array, fields["P"])
+    return _Estimates(x, P)
 
 
-def _by_step(recording: Recording, node: NodeId, decoder: Decoder) -> dict[int, Array]:
+def _by_step(recording: Recording, node: NodeId, decoder: Decoder) -> dict[int, Mapping[str, object]]:
     """A node's estimates."""
-    found: dict[int, Array] = {}
+    found: dict[int, Mapping[str, object]] = {}
     for record in recording.records([keys.stage_key(recording.metadata["run"], node, ESTIMATE.name)]):
         try:
             message = decoder.decode(record.data)
         except MessageError:
             continue  # nobody in the swarm took it for an estimate
-        found.setdefault(message.step, cast(Array, message.fields["x"]))
+        found.setdefault(message.step, message.fields)
     return found
 
 
@@ -215,18 +227,21 @@ class _Tested:
         common = ~np.isnan(list(errors.values())).any(axis=0)
         return NextReading(mote, int(common.sum()), **{name: _rms(error[common]) for name, error in errors.items()})
 
-    def held_out(self, mote: int, swarm: Array, alone: Array) -> HeldOut:
-        """From the states that all members estimated in the swarm and alone, each (members, rounds, nx)."""
+    def held_out(self, mote: int, swarm: _Estimates, alone: Array) -> HeldOut:
+        """From what all members estimated in the swarm, and their states alone, (members, rounds, nx)."""
         truth = self.after.of([mote])[:, 0]
-        by_node = [_rms(truth - estimate) for estimate in self.model.reading(mote, swarm)]
+        told = self.model.reading(mote, swarm.x)
+        variance = self.model.variance(mote, swarm.P)
+        most_certain = np.where(np.isnan(variance), np.inf, variance).argmin(axis=0)
+        by_node = [error for error in (_rms(truth - of_node) for of_node in told) if not np.isnan(error)]
         mean, distance = self._mean(mote)
         training = self.before.of([mote])[:, 0]
         return HeldOut(
             mote=mote,
             rounds=int((~np.isnan(truth)).sum()),
-            swarm=_rms(truth - self.model.reading(mote, swarm)),
-            best=min(by_node),
-            worst=max(by_node),
+            swarm=_rms(truth - told[most_certain, np.arange(len(truth))]),
+            nodes=_rms(truth - told),
+            worst=max(by_node, default=float("nan")),
             alone=_rms(truth - self.model.reading(mote, alone)),
             mean=_rms(truth - mean),
             corrected_mean=_rms(truth - mean - distance),
@@ -244,8 +259,9 @@ class _Tested:
         """Readings of the member whose distance from the mote varied least in the training, plus that distance."""
         distances = self.before.of([mote]) - self.before.of(self.model.members)
         typical = _mean(distances, axis=0)
-        nearest = int(_mean((distances - typical) ** 2, axis=0).argmin())
-        return self.after.of(self.model.members)[:, nearest] + typical[nearest]
+        nearest = self.model.members[int(np.nanargmin(_mean((distances - typical) ** 2, axis=0)))]
+        parallel: Array = self.after.of([nearest])[:, 0] + typical[self.model.members.index(nearest)]
+        return parallel
 
 
 def _mean(values: Array, axis: int) -> Array:

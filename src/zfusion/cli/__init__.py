@@ -1,0 +1,64 @@
+"""The command line: every command a few lines over the library.
+
+All commands: exit code 0 on success, 1 on a failed run or check, 2 on bad usage or input; with ``--json`` one JSON
+object on standard output, everything else on standard error.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from typing import Annotated
+
+import typer
+from rich.logging import RichHandler
+from rich.markup import escape
+
+from zfusion import __version__
+from zfusion.cli import live, models, recordings
+from zfusion.cli.common import err, out
+from zfusion.errors import ZfusionError
+
+app = typer.Typer(
+    name="zfusion",
+    help="Peer-to-peer state estimation in sensor networks, on Eclipse Zenoh.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (
+    live.launch,
+    live.simulate,
+    live.node,
+    live.record,
+    models.design,
+    recordings.replay,
+    recordings.info,
+    recordings.export,
+):
+    app.command()(command)
+
+
+def run() -> None:
+    """Run the command line and exit."""
+    try:
+        app()
+    except ZfusionError as error:
+        err.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
+        sys.exit(error.exit_code)
+
+
+@app.callback()
+def _options(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell more.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.", is_eager=True)] = False,
+) -> None:
+    if version:
+        out.print(f"zfusion {__version__}")
+        raise typer.Exit
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(message)s",
+        handlers=[RichHandler(console=err, show_path=False, markup=False)],
+    )

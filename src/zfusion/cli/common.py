@@ -1,0 +1,173 @@
+"""What the commands share: options, the shapes of output, and what ends them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from zfusion.errors import InputError, Problem, ScenarioError, ZfusionError
+from zfusion.keys import check_run
+from zfusion.methods import METHODS
+from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.model.types import NodeId
+
+err = Console(stderr=True, highlight=False)
+out = Console(highlight=False)
+
+ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario file (TOML).", show_default=False)]
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (MCAP).", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+Steps = Annotated[int | None, typer.Option(help="Steps to take.", min=1, show_default="the scenario's")]
+Seed = Annotated[int | None, typer.Option(help="Seed of all that is random.", min=0, show_default="the scenario's")]
+Rate = Annotated[float | None, typer.Option("--rate", help="Steps a second.", min=1e-6, show_default="the scenario's")]
+FreeRun = Annotated[bool, typer.Option("--free-run", help="Each step as soon as the one before is done.")]
+MethodName = Annotated[
+    str | None, typer.Option("--method", help="two_stage, local or centralized.", show_default="the scenario's")
+]
+RunName = Annotated[str | None, typer.Option("--run", help="Name of the run.", show_default="made up")]
+Connect = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to dial; may be repeated.")]
+Listen = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on; may be repeated.")]
+ControlFd = Annotated[int | None, typer.Option(hidden=True)]
+
+
+def load(
+    path: Path,
+    steps: int | None = None,
+    rate: float | None = None,
+    free_run: bool = False,
+    seed: int | None = None,
+    method: str | None = None,
+) -> Scenario:
+    """The scenario of a file with what the command line says instead; ScenarioError for what is wrong with it."""
+    loaded = load_scenario(
+        path, steps=steps, rate_hz=rate, free_run=True if free_run else None, seed=seed, method=method
+    )
+    check_method(loaded, str(path))
+    return loaded
+
+
+def check_method(scenario: Scenario, source: str) -> None:
+    """ScenarioError unless there is such a method, with such stages and options."""
+    problems = []
+    if scenario.method.name not in METHODS:
+        problems.append(Problem("method", scenario.method.name, f"expected one of {', '.join(METHODS)}"))
+    else:
+        stages = [stage.name for method in METHODS.values() for stage in method.stages]
+        known = ", ".join(dict.fromkeys(stages))
+        for stage, fraction in scenario.timing.deadlines.items():
+            if stage not in stages:
+                problems.append(Problem(f"timing.deadlines.{stage}", fraction, f"expected a stage: {known}"))
+        for option, value in scenario.method.options.items():
+            expected = f"the method {scenario.method.name} has no options"
+            problems.append(Problem(f"method.options.{option}", value, expected))
+    if problems:
+        raise ScenarioError(source, problems)
+
+
+def run_name(given: str | None, scenario: Scenario) -> str:
+    """The run's name: given, or made of the scenario's and the time."""
+    return check_run(given or f"{scenario.name}-{datetime.now(UTC):%Y%m%d-%H%M%S}")
+
+
+def given_run(given: str | None, scenario: Scenario) -> str:
+    """Processes that are started by hand must agree on the run's name: by default it is the scenario's."""
+    return check_run(given or scenario.name)
+
+
+def recording_path(scenario: Scenario, run: str, record: Path | None, no_record: bool) -> Path | None:
+    """Where the recording goes, None where there is to be none; InputError for a place that cannot be made."""
+    if record is not None and no_record:
+        raise typer.BadParameter("--record and --no-record exclude each other")
+    if no_record or (record is None and not scenario.recording.enabled):
+        return None
+    if record is not None:
+        path = record
+    elif scenario.recording.path is not None:
+        path = scenario.absolute(scenario.recording.path)
+    else:
+        path = default_directory(scenario) / f"{run}.mcap"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    return path.absolute()
+
+
+def default_directory(scenario: Scenario) -> Path:
+    """Where recordings and logs go unless something else is said."""
+    directory = scenario.recording.directory
+    return (scenario.absolute(directory) if directory else Path("recordings")).absolute()
+
+
+def node_named(scenario: Scenario, text: str) -> NodeId:
+    """The scenario's node of that id; InputError if there is none."""
+    try:
+        return scenario.node_id(text)
+    except (KeyError, ValueError):
+        known = ", ".join(str(i) for i in scenario.ids)
+        raise InputError(f"--id: expected a node of the scenario: {known} (is {text!r})") from None
+
+
+def epoch_ns(text: str) -> int:
+    """An RFC 3339 time in nanoseconds since 1970; InputError if it is none."""
+    try:
+        epoch = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"--epoch: expected a time like 2026-01-31T12:00:00Z (is {text!r})") from None
+    if epoch.tzinfo is None:
+        raise InputError(f"--epoch: expected a time with its offset, like 2026-01-31T12:00:00Z (is {text!r})")
+    return round(epoch.timestamp() * 1000) * 1_000_000
+
+
+def finish(result: Mapping[str, Any], as_json: bool, show: Callable[[], None]) -> None:
+    """The result, for programs or for people."""
+    if as_json:
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        show()
+
+
+def on_signals(stop: Callable[[], None]) -> None:
+    """Have `stop` called when somebody wants this process to end."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: stop())
+
+
+def control_of(descriptor: int | None, *, deadly: bool) -> Any:
+    """The line to the launcher, in a process that one started."""
+    if descriptor is None:
+        return None
+    from zfusion.swarm.control import ChildEnd, die_with_parent
+
+    if deadly:
+        die_with_parent()
+    return ChildEnd(descriptor)
+
+
+class ToldTo:
+    """Tells the launcher, too, why this process ends with an error."""
+
+    def __init__(self, control: Any) -> None:
+        self._control = control
+
+    def __enter__(self) -> None:
+        return
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if self._control is not None and isinstance(error, ZfusionError):
+            self._control.tell(error=str(error), exit_code=error.exit_code)
+
+
+def plain(value: Any) -> Any:
+    """Node ids as keys become text, as JSON has it."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    return value

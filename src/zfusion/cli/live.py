@@ -1,0 +1,208 @@
+"""Commands that run swarms: launch, node, record, simulate."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zfusion.cli.common import (
+    Connect,
+    ControlFd,
+    FreeRun,
+    Json,
+    Listen,
+    MethodName,
+    Rate,
+    RunName,
+    ScenarioFile,
+    Seed,
+    Steps,
+    ToldTo,
+    control_of,
+    default_directory,
+    epoch_ns,
+    err,
+    finish,
+    given_run,
+    load,
+    node_named,
+    on_signals,
+    out,
+    plain,
+    recording_path,
+    run_name,
+)
+from zfusion.model.scenario import load_scenario
+
+
+def launch(
+    scenario: ScenarioFile,
+    steps: Steps = None,
+    rate: Rate = None,
+    free_run: FreeRun = False,
+    seed: Seed = None,
+    method: MethodName = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
+    restart: Annotated[bool, typer.Option("--restart", help="Start a node that dies again.")] = False,
+    run: RunName = None,
+    as_json: Json = False,
+) -> None:
+    """Run a swarm on this machine: a process for every node, and the recorder."""
+    from zfusion.report.summary import show_summary, summarize
+    from zfusion.report.table import LiveTable
+    from zfusion.swarm.launch import Launcher, LaunchOptions
+
+    loaded = load(scenario, steps, rate, free_run, seed, method)
+    name = run_name(run, loaded)
+    recording = recording_path(loaded, name, record, no_record)
+    directory = recording.parent if recording is not None else default_directory(loaded)
+    logs = directory / f"{name}.logs"
+    with LiveTable(err, loaded, name, enabled=not as_json) as table:
+        launcher = Launcher(
+            loaded,
+            LaunchOptions(name, logs, recording, restart, on_update=table.update, on_message=table.message),
+        )
+        on_signals(launcher.interrupt)
+        result = launcher.run()
+    summary = summarize(
+        name,
+        loaded,
+        result.reports,
+        result.recorder,
+        failures=result.failures,
+        interrupted=result.interrupted,
+        logs=str(result.logs),
+    )
+    finish(summary, as_json, lambda: show_summary(out, summary))
+    if summary["failures"]:
+        raise typer.Exit(1)
+
+
+def simulate(
+    scenario: ScenarioFile,
+    steps: Steps = None,
+    rate: Rate = None,
+    free_run: FreeRun = False,
+    seed: Seed = None,
+    method: MethodName = None,
+    loss: Annotated[float, typer.Option(help="Probability that a message is lost on an edge.", min=0, max=1)] = 0.0,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
+    run: RunName = None,
+    as_json: Json = False,
+) -> None:
+    """Run the same swarm in virtual time: same nodes, same recording, same summary."""
+    from zfusion.drivers.links import Dropping, ideal
+    from zfusion.drivers.metrics import RecorderReport
+    from zfusion.drivers.simulated import simulate as run_simulation
+    from zfusion.recording import Recording
+    from zfusion.report.summary import show_summary, summarize
+
+    loaded = load(scenario, steps, rate, free_run, seed, method)
+    name = run_name(run, loaded)
+    path = recording_path(loaded, name, record, no_record)
+    link = Dropping(loss, loaded.seed) if loss else ideal
+    with err.status(f"simulating {loaded.steps} steps of {len(loaded.ids)} nodes"):
+        reports = run_simulation(loaded, run=name, output=path, link=link)
+    recorded = None
+    if path is not None:
+        with Recording.open(path) as recording:
+            recorded = RecorderReport.of(recording)
+    summary = summarize(name, loaded, reports, recorded)
+    finish(summary, as_json, lambda: show_summary(out, summary))
+
+
+def node(
+    scenario: ScenarioFile,
+    node_id: Annotated[str, typer.Option("--id", help="Which node of the scenario this is.")],
+    steps: Steps = None,
+    rate: Rate = None,
+    free_run: FreeRun = False,
+    seed: Seed = None,
+    method: MethodName = None,
+    run: RunName = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    epoch: Annotated[str | None, typer.Option(help="When step 0 is (RFC 3339).", show_default="agreed on")] = None,
+    await_recorder: Annotated[bool, typer.Option(help="Begin only when a recorder is there.")] = False,
+    forever: Annotated[bool, typer.Option("--forever", help="Take steps until stopped.")] = False,
+    as_json: Json = False,
+    control_fd: ControlFd = None,
+) -> None:
+    """Run one node: the same swarm on many machines, without the launcher."""
+    from zfusion.drivers.endpoints import endpoints_of
+    from zfusion.drivers.live import LiveNode, LiveOptions
+    from zfusion.report.summary import show_node_report
+
+    control = control_of(control_fd, deadly=True)
+    with ToldTo(control):
+        loaded = load(scenario, steps, rate, free_run, seed, method)
+        own = node_named(loaded, node_id)
+        options = LiveOptions(
+            run=given_run(run, loaded),
+            endpoints=endpoints_of(loaded, own, listen, connect),
+            recorder=await_recorder,
+            epoch_ns=None if epoch is None else epoch_ns(epoch),
+            steps=None if forever else loaded.steps,
+        )
+        tell = None if control is None else lambda status: control.tell(status=plain(asdict(status)))
+        live = LiveNode(loaded, own, options, tell)
+        on_signals(live.stop)
+        if control is not None:
+            control.on_stop(live.stop)
+        report = asdict(live.run())
+    if control is not None:
+        control.tell(report=report)
+        return
+    finish(report, as_json, lambda: show_node_report(out, report))
+
+
+def record(
+    scenario: ScenarioFile,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Recording to write.", show_default=False)],
+    run: RunName = None,
+    connect: Connect = None,
+    listen: Listen = None,
+    as_json: Json = False,
+    control_fd: ControlFd = None,
+) -> None:
+    """Record a run: the recorder alone, for swarms on many machines. Ends with Ctrl-C, or when all nodes have left."""
+    from zfusion.drivers.endpoints import recorder_endpoints
+    from zfusion.drivers.recorder import Recorder
+    from zfusion.methods import METHODS
+    from zfusion.recording.writer import RecordingWriter
+
+    control = control_of(control_fd, deadly=False)
+    with ToldTo(control):
+        loaded = load_scenario(scenario)
+        name = given_run(run, loaded)
+        method = loaded.method.name
+        output.parent.mkdir(parents=True, exist_ok=True)
+        writer = RecordingWriter(
+            output,
+            scenario_toml=loaded.anchored().to_toml(),
+            run=name,
+            method=method,
+            seed=loaded.seed,
+            stages=METHODS[method].stages,
+        )
+        tell = None if control is None else lambda report: control.tell(status=asdict(report))
+        recorder = Recorder(
+            loaded, name, recorder_endpoints(loaded, connect, listen), writer, until_all_gone=control is None, tell=tell
+        )
+        on_signals(recorder.stop)
+        if control is not None:
+            control.on_stop(recorder.stop)
+        report = asdict(recorder.run())
+    if control is not None:
+        control.tell(report=report)
+        return
+    finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))

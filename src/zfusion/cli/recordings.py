@@ -1,0 +1,172 @@
+"""Commands on recordings: replay, info, export."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zfusion.cli.common import (
+    Connect,
+    Json,
+    Listen,
+    MethodName,
+    RecordingFile,
+    RunName,
+    Seed,
+    check_method,
+    err,
+    finish,
+    load,
+    on_signals,
+    out,
+)
+from zfusion.model.scenario import Overrides, Scenario
+
+if TYPE_CHECKING:
+    from zfusion.drivers.playback import Extent
+    from zfusion.recording import Recording
+
+DEFAULT_PLAYER = ("tcp/127.0.0.1:7449",)
+"""Where a player listens, for consumers to connect to."""
+
+FromStep = Annotated[int | None, typer.Option(help="First step to play.", min=0)]
+
+
+def replay(
+    recording: RecordingFile,
+    verify: Annotated[bool, typer.Option("--verify", help="Recompute every estimate and compare every bit.")] = False,
+    publish: Annotated[bool, typer.Option("--publish", help="Publish the messages again, on the same keys.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Run the measurements again, and record that here.")
+    ] = None,
+    method: MethodName = None,
+    scenario: Annotated[
+        Path | None, typer.Option(help="Run the measurements through this scenario.", show_default="the recorded one")
+    ] = None,
+    loss: Annotated[
+        float, typer.Option(help="Probability that a message is lost, when run again.", min=0, max=1)
+    ] = 0.0,
+    seed: Seed = None,
+    speed: Annotated[float, typer.Option(help="How many times as fast; 0: as fast as possible.", min=0)] = 1.0,
+    start: Annotated[float | None, typer.Option(help="Seconds from the beginning to start at.", min=0)] = None,
+    end: Annotated[float | None, typer.Option(help="Seconds from the beginning to end at.", min=0)] = None,
+    first_step: FromStep = None,
+    last_step: Annotated[int | None, typer.Option(help="Last step to play.", min=0)] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    topic: Annotated[
+        list[str] | None, typer.Option(help="Only topics that match, like '*/estimate'; repeatable.")
+    ] = None,
+    node: Annotated[list[str] | None, typer.Option(help="Only this node's; repeatable.")] = None,
+    stage: Annotated[list[str] | None, typer.Option(help="Only this stage's; repeatable.")] = None,
+    run: RunName = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    as_json: Json = False,
+) -> None:
+    """Prove a recording (--verify), play it again (--publish), or run its measurements otherwise (-o)."""
+    from zfusion.drivers.playback import Extent
+    from zfusion.recording import Recording
+
+    if verify + publish + (output is not None) != 1:
+        raise typer.BadParameter("expected one of --verify, --publish and --output")
+    with Recording.open(recording) as opened:
+        if verify:
+            _verify(opened, as_json)
+        elif output is not None:
+            _rerun(opened, output, scenario, Overrides(method=method, seed=seed), loss, run, as_json)
+        else:
+            extent = Extent(start, end, first_step, last_step)
+            _publish(opened, extent, (node, stage, topic), speed, loop, (listen, connect), as_json)
+
+
+def _verify(recording: Recording, as_json: bool) -> None:
+    from zfusion.drivers.replayed import verify
+    from zfusion.report.replay import show_verdict
+
+    with err.status("recomputing"):
+        verdict = verify(recording)
+    finish(verdict.as_dict(), as_json, lambda: show_verdict(out, verdict))
+    if not verdict.verified or verdict.unverifiable:
+        raise typer.Exit(1)
+
+
+def _rerun(
+    recording: Recording,
+    output: Path,
+    scenario: Path | None,
+    overrides: Overrides,
+    loss: float,
+    run: str | None,
+    as_json: bool,
+) -> None:
+    from zfusion.drivers.links import Dropping, ideal
+    from zfusion.drivers.replayed import recorded_scenario
+    from zfusion.drivers.rerun import rerun
+    from zfusion.report.replay import show_rerun
+
+    other: Scenario = load(scenario) if scenario is not None else recorded_scenario(recording)
+    other = other.with_overrides(**overrides)
+    check_method(other, str(scenario or recording.path))
+    link = Dropping(loss, other.seed) if loss else ideal
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with err.status("running the measurements again"):
+        done = rerun(recording, other, output, link=link, run=run)
+    finish({"recording": str(output), "nodes": done.as_dict()}, as_json, lambda: show_rerun(out, done, output))
+
+
+def _publish(
+    recording: Recording,
+    extent: Extent,
+    chosen: tuple[list[str] | None, list[str] | None, list[str] | None],
+    speed: float,
+    loop: bool,
+    endpoints: tuple[list[str] | None, list[str] | None],
+    as_json: bool,
+) -> None:
+    from zfusion.drivers.endpoints import Endpoints
+    from zfusion.drivers.playback import Player, choose_topics
+    from zfusion.drivers.transport import open_session, republisher
+
+    nodes, stages, patterns = (tuple(of or ()) for of in chosen)
+    topics = choose_topics(recording, nodes=nodes, stages=stages, patterns=patterns)
+    listen, connect = (tuple(of or ()) for of in endpoints)
+    with open_session(Endpoints(listen or DEFAULT_PLAYER, connect)) as session:
+        player = Player(recording, republisher(session), speed=speed, extent=extent, topics=topics, loop=loop)
+        on_signals(player.stop)
+        err.print(f"publishing {recording.metadata['run']} on {', '.join(listen or DEFAULT_PLAYER)}")
+        played = player.run()
+    finish({"played": played}, as_json, lambda: out.print(f"{played} messages published"))
+
+
+def info(recording: RecordingFile, as_json: Json = False) -> None:
+    """Tell what is on a recording, what is missing and what made it."""
+    from zfusion.recording import Recording
+    from zfusion.recording.info import info as information
+    from zfusion.report.recording import show_info
+
+    with Recording.open(recording) as opened:
+        told = information(opened)
+    finish(told.as_dict(), as_json, lambda: show_info(out, told))
+
+
+def export(
+    recording: RecordingFile,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write.", show_default="beside the recording")
+    ] = None,
+    format: Annotated[str, typer.Option("--format", "-f", help="csv, jsonl or npz.")] = "csv",
+    topic: Annotated[list[str] | None, typer.Option(help="Only this topic; may be repeated.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a recording's numbers for other tools."""
+    from zfusion.recording import Recording
+    from zfusion.recording.export import export as write
+
+    target = output or recording.with_suffix(f".{format}")
+    with Recording.open(recording) as opened:
+        done = write(opened, target, format, topics=topic)
+    result = {"output": str(target), **asdict(done)}
+    finish(result, as_json, lambda: out.print(f"{done.messages} messages in {target}", soft_wrap=True))
