@@ -21,7 +21,8 @@ LAYERS = (
     ("recording",),
     ("drivers",),
     ("swarm",),
-    ("report", "library"),
+    ("studies",),
+    ("report",),
     ("cli",),
     ("__main__",),
 )

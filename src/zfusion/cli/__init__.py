@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import live, models, recordings
+from zfusion.cli import library, live, models, recordings
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -38,6 +38,7 @@ for command in (
     recordings.export,
 ):
     app.command()(command)
+app.add_typer(library.app, name="library")
 
 
 def run() -> None:

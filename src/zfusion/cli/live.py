@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,7 +35,7 @@ from zfusion.cli.common import (
     recording_path,
     run_name,
 )
-from zfusion.model.scenario import load_scenario
+from zfusion.model.scenario import Scenario, load_scenario
 
 
 def launch(
@@ -54,34 +54,41 @@ def launch(
     as_json: Json = False,
 ) -> None:
     """Run a swarm on this machine: a process for every node, and the recorder."""
-    from zfusion.report.summary import show_summary, summarize
-    from zfusion.report.table import LiveTable
-    from zfusion.swarm.launch import Launcher, LaunchOptions
+    from zfusion.report.summary import show_summary
 
     loaded = load(scenario, steps, rate, free_run, seed, method)
     name = run_name(run, loaded)
     recording = recording_path(loaded, name, record, no_record)
-    directory = recording.parent if recording is not None else default_directory(loaded)
-    logs = directory / f"{name}.logs"
-    with LiveTable(err, loaded, name, enabled=not as_json) as table:
-        launcher = Launcher(
-            loaded,
-            LaunchOptions(name, logs, recording, restart, on_update=table.update, on_message=table.message),
-        )
+    summary = launched(loaded, name, recording, restart=restart, quiet=as_json)
+    finish(summary, as_json, lambda: show_summary(out, summary))
+    if summary["failures"]:
+        raise typer.Exit(1)
+
+
+def launched(
+    scenario: Scenario, run: str, recording: Path | None, *, restart: bool = False, quiet: bool = False
+) -> dict[str, Any]:
+    """Launch a swarm, show how it goes unless `quiet`, and summarise it."""
+    from zfusion.report.summary import summarize
+    from zfusion.report.table import LiveTable
+    from zfusion.swarm.launch import Launcher, LaunchOptions
+
+    directory = recording.parent if recording is not None else default_directory(scenario)
+    logs = directory / f"{run}.logs"
+    with LiveTable(err, scenario, run, enabled=not quiet) as table:
+        options = LaunchOptions(run, logs, recording, restart, on_update=table.update, on_message=table.message)
+        launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
-    summary = summarize(
-        name,
-        loaded,
+    return summarize(
+        run,
+        scenario,
         result.reports,
         result.recorder,
         failures=result.failures,
         interrupted=result.interrupted,
         logs=str(result.logs),
     )
-    finish(summary, as_json, lambda: show_summary(out, summary))
-    if summary["failures"]:
-        raise typer.Exit(1)
 
 
 def simulate(

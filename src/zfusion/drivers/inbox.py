@@ -21,8 +21,8 @@ import zenoh
 Channel = TypeVar("Channel", bound=Hashable)
 
 CHANNEL = 16_384
-"""Messages of one key that wait here; beyond that they wait in the sockets, and then at the sender. Room for what a swarm
-says while one of its nodes, just restarted, gets ready to follow it."""
+"""Messages of one key that wait here; beyond that they wait in the sockets, and then at the sender. Room for what a
+swarm says while one of its nodes, just restarted, gets ready to follow it."""
 
 STRETCH_NS = 10_000_000
 """How long a wait may go on before it is ended so that the other channels can be looked into: far longer than the waits
@@ -33,8 +33,10 @@ NEVER = 2**63
 
 
 class Wake:
-    """Ends another thread's wait, or its next one. Unlike `threading.Event` it may be used in a signal handler, whatever
-    the thread that this interrupts is doing."""
+    """Ends another thread's wait, or its next one.
+
+    Unlike `threading.Event` it may be used in a signal handler, whatever the thread that this interrupts is doing.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -1,7 +1,7 @@
 """Measurements that a user's own sensor program publishes on a Zenoh key.
 
-A reading is a number or a list of numbers: JSON text, or msgpack where the message's encoding is ``application/msgpack``. What is
-no reading is counted and dropped.
+A reading is a number or a list of numbers: JSON text, or msgpack where the message's encoding is
+``application/msgpack``. What is no reading is counted and dropped.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MSGPACK = "application/msgpack"
 class KeySource:
     """The newest reading on a key, each taken once.
 
-    A paced node takes what has come since its last step, None where nothing has; a free-running one waits up to `wait_s`
-    for the next.
+    A paced node takes what has come since its last step, None where nothing has; a free-running one waits up to
+    `wait_s` for the next.
     """
 
     def __init__(self, session: zenoh.Session, node: NodeId, key: str, ny: int, wait_s: float) -> None:
@@ -51,7 +51,7 @@ class KeySource:
 
     def close(self) -> None:
         """Stop listening."""
-        self._subscriber.undeclare()
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _take(self, sample: Any) -> None:
         try:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
 from itertools import count
-from typing import Any
+from typing import Any, ClassVar
 
 import zenoh
 
@@ -129,7 +129,7 @@ class LiveNode:
         try:
             self._source: Source = open_source(scenario, node, self._subscribe)
         except InputError:
-            self._session.close()
+            self._session.close()  # type: ignore[no-untyped-call]
             raise
         self._inbox = Inbox(self._session)
 
@@ -312,8 +312,8 @@ class LiveNode:
             self._catch_up(node)
         for j in node.silent:
             self._inbox.drain([channel for channel in self._decoders if channel[0] == j], self._take)
-        while node.stage is not None and not self._stopping:
-            self._await_message(node)
+        while (stage := node.stage) is not None and not self._stopping:
+            self._await_message(node, (node.awaiting[0], stage))
         if node.stage is None:
             latency = time.perf_counter_ns() - began
             now = time.time_ns()
@@ -324,9 +324,8 @@ class LiveNode:
             account.compare(estimate)
         self._estimates.clear()
 
-    def _await_message(self, node: Node) -> None:
+    def _await_message(self, node: Node, channel: Channel) -> None:
         """Wait for one message, the deadline or a notice, and act on it."""
-        channel = (node.awaiting[0], node.stage)
         data = self._inbox.wait(channel, node.deadline)
         if data is not None:
             self._take(channel, data)
@@ -424,7 +423,7 @@ class LiveNode:
         self._unconfirmed.discard(j)
         if self._node is None or self._phase is not Phase.RUNNING or j not in self._meeting.hears:
             return
-        # Its last messages may be waiting behind this notice. They are told, for they may not have come to the recorder.
+        # Its last messages may be waiting behind this notice. They are told: they may not have come to the recorder.
         channels = [channel for channel in self._decoders if channel[0] == j]
         self._inbox.drain(channels, self._take)
         last = [decode_any(self._last_heard[channel]) for channel in channels if channel in self._last_heard]
@@ -480,7 +479,7 @@ class LiveNode:
             answer = HistoryAnswer(node.born, own.last, own.runs(own.last))
             query.reply(keys.history_key(self._options.run, self.id), answer.encode())
 
-    _handlers: dict[str, Callable[[LiveNode, Any], None]] = {
+    _handlers: ClassVar[dict[str, Callable[[LiveNode, Any], None]]] = {
         "token": _on_token,
         "recorder": _on_recorder,
         "status!": _on_status,

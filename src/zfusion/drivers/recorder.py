@@ -29,7 +29,7 @@ from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ESTIMATE, EVENT, TRUTH, TRUTH_SENDER, Stage
 
 CAPACITY = 65_536
-"""Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it the senders wait, and lose nothing."""
+"""Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
 
 CHANNEL = "all"
 

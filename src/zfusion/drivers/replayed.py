@@ -113,6 +113,10 @@ class _Life:
         self.heard: dict[NodeId, int] = {}
         """The neighbours' lives that it has heard."""
         self.doubt: _Doubt | None = None
+        self.differences = 0
+        """Since its last event: they count only if that which follows shows that no event is missing."""
+        self.first: Difference | None = None
+        """Of them, that of the lowest step."""
         self.comparison = Comparison(tolerance)
 
     def begin(self, step: int) -> None:
@@ -177,6 +181,7 @@ class _Verifier:
         for lives in self._lives.values():
             for life in lives.values():
                 self._go_on(life, ended=True)
+                self._settle(life)
 
     def _decoder(self, node: NodeId, stage: str) -> Decoder:
         system = self._scenario.system()
@@ -200,7 +205,7 @@ class _Verifier:
 
     def _take_event(self, message: Message) -> None:
         life = self._life(message.node, message.born)
-        self._count(life, message)
+        self._settle(life, proven=not self._count(life, message))
         data = cast("dict[str, object]", message.fields["data"])
         if message.fields["kind"] == "history":
             of = self._neighbour(message.node, data)
@@ -325,6 +330,7 @@ class _Verifier:
         """The own measurement; if it is not there, a stand-in where there was one."""
         if measurement is not None:
             return cast("Array | None", measurement.fields["y"])
+        life.doubt = _Doubt.MISSING  # it is counted when the next comes
         return self._stand_in(life.id) if following is not None and life.id in _inputs(following) else None
 
     def _feed(self, life: _Life, node: Node, stage: str, step: int, senders: Iterable[NodeId]) -> None:
@@ -369,17 +375,28 @@ class _Verifier:
         elif life.doubt is _Doubt.MISSING:
             tally.unverifiable += 1
         else:
-            tally.different += 1
             name, ulps = found
             here = Difference(life.id, life.born, told.step, stage, name, told.fields[name], again.fields[name], ulps)
-            if self.first is None or self._place(here) < self._place(self.first):
-                self.first = here
+            life.differences += 1
+            life.first = life.first or here
+
+    def _settle(self, life: _Life, proven: bool = True) -> None:
+        """Count a life's differences as that, or, where an event is missing that may explain them, as unverifiable."""
+        tally = self.tallies[life.id]
+        if proven:
+            tally.different += life.differences
+            first = life.first
+            if first is not None and (self.first is None or self._place(first) < self._place(self.first)):
+                self.first = first
+        else:
+            tally.unverifiable += life.differences
+        life.differences, life.first = 0, None
 
     def _place(self, difference: Difference) -> tuple[int, int, int]:
         return difference.step, self._order[difference.stage], self._graph.ids.index(difference.node)
 
-    def _count(self, life: _Life, message: Message) -> None:
-        """Notice by the sender's counter what is missing before a message."""
+    def _count(self, life: _Life, message: Message) -> bool:
+        """Notice by the sender's counter what is missing before a message; whether something is."""
         stage, expected = message.stage, life.counters.get(message.stage, 0)
         lost = message.seq - expected
         if lost >= 0:
@@ -388,6 +405,7 @@ class _Verifier:
             self._miss(life, f"{lost} x {stage} of node {life.id} before step {message.step}")
             if self._order.get(stage, 0) > 0:
                 self.tallies[life.id].unverifiable += lost
+        return lost > 0
 
     def _miss(self, life: _Life, what: str, cut_off: bool = False) -> None:
         """Something that this life depends on is not there: from now on a difference proves nothing."""

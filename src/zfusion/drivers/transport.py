@@ -34,8 +34,8 @@ BLOCK_US = 60_000_000
 is slower than we are, which is no reason to lose its messages."""
 
 MAX_RECEIVED = 16 << 20
-"""Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times what
-zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
+"""Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times
+what zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
 
 LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
 """About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
@@ -61,7 +61,7 @@ def open_session(
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """A publisher to the other sessions on `key`: nothing waits to be batched, nothing is dropped for being too much."""
+    """A publisher to the other sessions on `key`: nothing waits for a batch, nothing is dropped for being too much."""
     return session.declare_publisher(
         key,
         express=True,
@@ -72,8 +72,10 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 
 def on_zenoh_thread(callback: Callable[[Any], None]) -> Any:
-    """A callback run on Zenoh's own thread, for one that only leaves a notice: a thread of its own would keep the process
-    from exiting."""
+    """A callback run on Zenoh's own thread, for one that only leaves a notice.
+
+    (A thread of its own, Zenoh's default, would keep the process from exiting.)
+    """
     return zenoh.handlers.Callback(callback, indirect=False)
 
 

@@ -15,6 +15,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 STOP = b"stop\n"
@@ -45,10 +46,8 @@ class ChildEnd:
         threading.Thread(target=self._listen, args=(stop,), name="control", daemon=True).start()
 
     def _listen(self, stop: Callable[[], None]) -> None:
-        try:
+        with suppress(OSError):  # gone: the same as the end of the line
             self._socket.recv(len(STOP))
-        except OSError:
-            pass  # gone: the same as the end of the line
         stop()
 
 

@@ -38,8 +38,8 @@ TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
 
 PORTS = range(20_000, 32_000)
-"""Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them between
-our finding it free and the node's listening on it."""
+"""Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
+between our finding it free and the node's listening on it."""
 
 _tried = count(os.getpid() * 61)
 """Two launchers begin at different places."""

@@ -1,0 +1,341 @@
+"""The covariance recursion against projection on the stacked measurements, and what it must do in the long run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from oracles import brute_force, paper, random_systems
+from oracles.brute_force import Estimates, StackedSystem, Used
+from zfusion.methods import covariances
+from zfusion.methods.covariances import Layout, State, advance, forget, prior
+from zfusion.model.matrices import Fixed, Schedule
+from zfusion.model.noise import MovingAverageNoise, Tap, WhiteNoise
+from zfusion.model.statistics import StepModel, prior_moments, step_models
+from zfusion.model.system import Sensor, System
+from zfusion.model.types import Array, NodeId
+
+STEPS = 12
+NAMES: tuple[NodeId, ...] = ("attic", "cellar", "hall", "yard")
+KINDS: list[dict[str, Any]] = [
+    {"nx": 1},
+    {"nx": 2, "ids": NAMES, "varying": True},
+    {"nx": 3},
+    {"nx": 3, "noise": "white"},
+    {"nx": 2, "radius": 1.2, "varying": True},
+    {"nx": 2, "multiplicative": False},
+    {"radius": 1.3, "multiplicative": False},
+    {"mean": 5.0},
+]
+Neighbours = Mapping[NodeId, tuple[NodeId, ...]]
+
+
+class Recursion:
+    """The recursion for chosen nodes of a system, step by step."""
+
+    def __init__(
+        self, system: System, neighbours: Neighbours, pairs: Iterable[tuple[NodeId, NodeId]] | None = None
+    ) -> None:
+        self.layout = Layout.build(neighbours, {sensor.id: sensor.ny for sensor in system.sensors}, pairs)
+        self.state = prior(self.layout, system.initial_covariance)
+        self.moments = prior_moments(system)
+        self._models = step_models(system, system.ids)
+        self.model: StepModel | None = None
+
+    def step(self, used: Neighbours) -> State:
+        self.model, self.moments = next(self._models)
+        self.state = advance(self.layout, self.state, self.model, self.layout.used(used))
+        return self.state
+
+    def covariance(self, i: NodeId, j: NodeId) -> Array:
+        """P^(ij)."""
+        a, b = self.layout.nodes.index(i), self.layout.nodes.index(j)
+        found: Array = self.state.P[a, :, self.layout.places([a, b])[0, 1]]
+        return found
+
+
+def at_step(used: Used, k: int) -> dict[NodeId, tuple[NodeId, ...]]:
+    return {i: members for (i, step), members in used.items() if step == k}
+
+
+def projected(
+    rng: np.random.Generator, system: System, neighbours: Neighbours
+) -> tuple[Used, StackedSystem, dict[NodeId, Estimates]]:
+    """Random used sets, and what projection makes of them."""
+    used = random_systems.random_used_sets(rng, neighbours, STEPS)
+    stacked = brute_force.stack(system, STEPS)
+    return used, stacked, {i: brute_force.intermediate(stacked, i, used) for i in neighbours}
+
+
+def worst(recursion: Recursion, estimates: Mapping[NodeId, Estimates], k: int) -> float:
+    """Largest difference of any P^(ij) from the projection's, in parts of the two nodes' own variances."""
+    size = {i: np.abs(e.errors[k] @ e.errors[k].T).max() ** 0.5 for i, e in estimates.items()}
+    return max(
+        float(np.abs(recursion.covariance(i, j) - e.errors[k] @ f.errors[k].T).max() / (size[i] * size[j]))
+        for i, e in estimates.items()
+        for j, f in estimates.items()
+    )
+
+
+# --- against projection
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+@pytest.mark.parametrize("seed", range(4))
+def test_all_pairs_are_those_of_projection_whatever_was_used(kind: dict[str, Any], seed: int) -> None:
+    rng = np.random.default_rng([1, seed])
+    system = random_systems.random_system(rng, **kind)
+    if seed == 3:
+        system = random_systems.by_covariances(system)
+    neighbours = random_systems.random_graph(rng, system.ids)
+    used, _, estimates = projected(rng, system, neighbours)
+    recursion = Recursion(system, neighbours)
+    for k in range(1, STEPS + 1):
+        recursion.step(at_step(used, k))
+        assert worst(recursion, estimates, k) < 1e-11
+
+
+def test_the_published_example() -> None:
+    recursion = Recursion(paper.paper_system(), paper.NEIGHBOURS)
+    alone = Recursion(paper.paper_system(), {i: (i,) for i in paper.NEIGHBOURS}, pairs=())
+    everything = Recursion(paper.paper_system(), {1: (1, 2, 3, 4)})
+    for k in range(1, 101):
+        recursion.step(paper.NEIGHBOURS)
+        alone.step({i: (i,) for i in paper.NEIGHBOURS})
+        everything.step({1: (1, 2, 3, 4)})
+        if k in paper.ERROR_VARIANCES:
+            wanted = paper.ERROR_VARIANCES[k]
+            for estimate, found in {"intermediate": recursion, "local": alone, "centralized": everything}.items():
+                np.testing.assert_allclose(found.state.P[:, 0, 0, 0], wanted[estimate], rtol=0, atol=1e-9)
+
+
+def test_every_pair_is_symmetric_to_the_last_bit() -> None:
+    rng = np.random.default_rng(2)
+    for kind in KINDS:
+        system = random_systems.random_system(rng, **kind)
+        neighbours = random_systems.random_graph(rng, system.ids)
+        recursion = Recursion(system, neighbours)
+        for _ in range(5):
+            state = recursion.step(neighbours)
+            assert np.array_equal(recursion.layout.flip(state.P), state.P)
+            assert np.array_equal(recursion.layout.flip(state.Pi), state.Pi)
+
+
+def test_a_layout_of_chosen_pairs_gives_the_same_as_one_of_all() -> None:
+    rng = np.random.default_rng(3)
+    system = random_systems.random_system(rng, ids=range(7), nx=2)
+    neighbours = random_systems.random_graph(rng, system.ids)
+    pairs: list[tuple[NodeId, NodeId]] = [(0, 3), (5, 3), (3, 5), (6, 1), (2, 2)]
+    every, chosen = Recursion(system, neighbours), Recursion(system, neighbours, pairs)
+    used = random_systems.random_used_sets(rng, neighbours, STEPS)
+    assert chosen.layout.partners.shape[1] == 3  # node 3 and two others: the rest is padding
+    for k in range(1, STEPS + 1):
+        every.step(at_step(used, k))
+        chosen.step(at_step(used, k))
+        for i, j in [*pairs, *((i, i) for i in system.ids)]:
+            np.testing.assert_allclose(chosen.covariance(i, j), every.covariance(i, j), rtol=1e-12, atol=1e-14)
+            np.testing.assert_array_equal(chosen.covariance(j, i), chosen.covariance(i, j).T)
+    with pytest.raises(KeyError):
+        chosen.covariance(0, 1)
+
+
+def test_a_node_that_forgets_is_one_that_has_used_nothing_so_far() -> None:
+    rng = np.random.default_rng(4)
+    for kind in KINDS:
+        system = random_systems.random_system(rng, **kind)
+        neighbours = random_systems.random_graph(rng, system.ids)
+        used = dict(random_systems.random_used_sets(rng, neighbours, STEPS, late=0))
+        lost = set(system.ids[::2])
+        forgetful, newborn = Recursion(system, neighbours), Recursion(system, neighbours)
+        for k in range(1, STEPS + 1):
+            if k == 6:
+                rows = [row for row, i in enumerate(forgetful.layout.nodes) if i in lost]
+                covariance = forgetful.moments.covariance
+                forgetful.state = forget(forgetful.layout, forgetful.state, rows, covariance)
+            forgetful.step(at_step(used, k))
+            newborn.step({i: () if k < 6 and i in lost else used[i, k] for i in neighbours})
+        scale = np.abs(newborn.state.P).max()
+        np.testing.assert_allclose(forgetful.state.P, newborn.state.P, rtol=0, atol=1e-12 * scale)
+
+
+def test_what_is_known_of_a_past_state_is_not_changed_by_going_on() -> None:
+    rng = np.random.default_rng(5)
+    system = random_systems.random_system(rng, ids=NAMES)
+    recursion = Recursion(system, dict.fromkeys(NAMES, NAMES))
+    states = [recursion.step({i: NAMES[:k] for i in NAMES}) for k in (4, 2, 0, 3)]
+    copies = [[np.copy(array) for array in (s.P, s.E, s.Pi, s.X, s.A)] for s in states]
+    forget(recursion.layout, recursion.state, [1], recursion.moments.covariance)
+    recursion.step({})
+    for state, copy in zip(states, copies, strict=True):
+        for array, before in zip((state.P, state.E, state.Pi, state.X, state.A), copy, strict=True):
+            assert np.array_equal(array, before)
+
+
+# --- innovations that can be predicted
+
+
+def fixed_system(
+    F: Array, Q: Array, H: Mapping[NodeId, Array], noise: Mapping[NodeId, Mapping[int, float]], P0: float = 1.0
+) -> System:
+    """A system without random matrices; `noise` gives each sensor's v as lag -> weight of one common white noise."""
+    nx = len(F)
+    return System(
+        nx=nx,
+        initial_mean=np.zeros(nx),
+        initial_covariance=P0 * np.eye(nx),
+        F=Schedule((Fixed(F),)),
+        sensors=tuple(Sensor(i, len(h), Schedule((Fixed(h),), first=1)) for i, h in H.items()),
+        noise=MovingAverageNoise(
+            white={"w": WhiteNoise(Q), "n": WhiteNoise(np.eye(1))},
+            process=(Tap("w", 0, Schedule((np.eye(nx),))),),
+            sensors={
+                i: tuple(Tap("n", lag, Schedule((np.full((len(h), 1), noise[i][lag]),))) for lag in noise[i])
+                for i, h in H.items()
+            },
+        ),
+    )
+
+
+ONE = np.ones((1, 1))
+DRIFT = np.array([[1.0, 1.0], [0.0, 1.0]])
+POSITION, VELOCITY = np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]])
+PREDICTABLE = {
+    "the same sensor three times": fixed_system(
+        0.9 * ONE, 0.5 * ONE, dict.fromkeys((1, 2, 3), ONE), dict.fromkeys((1, 2, 3), {0: 1.0})
+    ),
+    "one noise in different sensors": fixed_system(
+        0.9 * ONE, 0.5 * ONE, {1: ONE, 2: 1.5 * ONE, 3: 2 * ONE}, dict.fromkeys((1, 2, 3), {0: 1.0})
+    ),
+    "sensors without noise": fixed_system(
+        0.9 * ONE, 0.5 * ONE, {1: ONE, 2: ONE, 3: 2 * ONE}, dict.fromkeys((1, 2, 3), {0: 0.0})
+    ),
+    "a static state and a sensor without noise": fixed_system(
+        ONE, 0 * ONE, dict.fromkeys((1, 2, 3), ONE), {1: {0: 0.0}, 2: {0: 1.0}, 3: {0: 0.0}}, P0=1e6
+    ),
+    "a noise that cancels over time": fixed_system(
+        0.9 * ONE, 0.5 * ONE, {1: ONE, 2: ONE, 3: 0 * ONE}, {1: {0: 1.0, -1: 1.0}, 2: {0: 1.0, -1: -1.0}, 3: {0: 0.0}}
+    ),
+    "an exact position": fixed_system(
+        DRIFT, 0.01 * np.eye(2), {1: POSITION, 2: POSITION, 3: VELOCITY}, {1: {0: 0.0}, 2: {0: 1.0}, 3: {0: 1.0}}
+    ),
+    "an exact position, nothing moves it": fixed_system(
+        DRIFT, np.zeros((2, 2)), {1: POSITION, 2: POSITION, 3: VELOCITY}, {1: {0: 0.0}, 2: {0: 1.0}, 3: {0: 1.0}}
+    ),
+    "nothing to estimate": fixed_system(
+        0.9 * ONE, 0 * ONE, dict.fromkeys((1, 2, 3), ONE), {1: {0: 0.0}, 2: {0: 1.0}, 3: {0: 1.0}}, P0=0.0
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PREDICTABLE)
+def test_a_singular_innovation_covariance_is_a_legal_one(name: str) -> None:
+    system = PREDICTABLE[name]
+    neighbours: Neighbours = {1: (1, 2, 3), 2: (1, 2), 3: (3,)}
+    stacked = brute_force.stack(system, STEPS)
+    always = brute_force.always(neighbours, STEPS)
+    estimates = {i: brute_force.intermediate(stacked, i, always) for i in neighbours}
+    recursion = Recursion(system, neighbours)
+    for k in range(1, STEPS + 1):
+        state = recursion.step(neighbours)
+        scale = max(np.abs(recursion.moments.covariance).max(), 1e-300)
+        for i in neighbours:
+            for j in neighbours:
+                wanted = estimates[i].errors[k] @ estimates[j].errors[k].T
+                np.testing.assert_allclose(recursion.covariance(i, j), wanted, rtol=0, atol=1e-11 * scale)
+        assert np.isfinite(state.A).all()
+
+
+def test_what_cannot_be_predicted_is_not_taken_for_it() -> None:
+    """Two sensors that are nearly the same: the small difference is information, and it is used."""
+    system = fixed_system(0.9 * ONE, 0.5 * ONE, {1: ONE, 2: 1.001 * ONE}, dict.fromkeys((1, 2), {0: 1.0}))
+    recursion = Recursion(system, {1: (1, 2)})
+    for _ in range(3):
+        recursion.step({1: (1, 2)})
+    assert recursion.state.P[0, 0, 0, 0] < 1e-9
+
+
+# --- in the long run
+
+
+def steps_until_settled(recursion: Recursion, used: Neighbours, limit: int) -> int:
+    for k in range(1, limit + 1):
+        before = recursion.state
+        if recursion.step(used) is before:
+            return k
+    raise AssertionError(f"not settled after {limit} steps")
+
+
+@pytest.mark.parametrize("kind", [{"nx": 1}, {"nx": 2}, {"nx": 3, "noise": "white"}, {"nx": 3, "multiplicative": False}])
+def test_a_time_invariant_network_settles_and_then_costs_nothing(
+    kind: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(6)
+    system = random_systems.random_system(rng, **kind)
+    neighbours = random_systems.random_graph(rng, system.ids)
+    recursion = Recursion(system, neighbours)
+    steps_until_settled(recursion, neighbours, 1000)
+
+    work: list[int] = []
+    compute = covariances._predict
+    monkeypatch.setattr(covariances, "_predict", lambda *arguments: work.append(1) or compute(*arguments))
+    settled = recursion.state
+    for _ in range(50):
+        assert recursion.step(neighbours) is settled
+    assert not work
+    recursion.step({**neighbours, system.ids[0]: ()})
+    assert len(work) == 1
+    assert steps_until_settled(recursion, neighbours, 1000) > 2
+    np.testing.assert_allclose(recursion.state.P, settled.P, rtol=1e-11, atol=1e-13)
+
+
+def test_settling_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, neighbours = paper.paper_system(), paper.NEIGHBOURS
+    settling = Recursion(system, neighbours)
+    states = [settling.step(neighbours) for _ in range(1500)]
+    assert states[-1] is states[-2]
+    monkeypatch.setattr(covariances, "_settled", lambda *_: False)
+    working = Recursion(system, neighbours)
+    for state in states:
+        assert working.step(neighbours) is not state
+        np.testing.assert_allclose(state.P, working.state.P, rtol=1e-12)
+    assert working.state.gains is not None
+    assert states[-1].gains is not None
+    np.testing.assert_allclose(states[-1].gains.K, working.state.gains.K, rtol=1e-12)
+
+
+def test_a_target_is_tracked_for_a_hundred_thousand_steps_without_drift() -> None:
+    """A constant-velocity target: its own variance grows like k³, that of the error must not move.
+
+    A recursion that lets rounding in the antisymmetric part of a pair grow is at 1e41 after 400 steps.
+    """
+    neighbours: Neighbours = {1: (1, 2), 2: (2, 3), 3: (1, 3)}
+    system = tracked_target()
+    recursion = Recursion(system, neighbours)
+    model = next(step_models(system, system.ids))[0]
+    for model, _ in zip_steps(system, 3):
+        recursion.state = advance(recursion.layout, recursion.state, model, recursion.layout.used(neighbours))
+    used = recursion.layout.used(neighbours)
+    state, early = recursion.state._replace(settled=False), None
+    for k in range(4, 40_001):
+        state = advance(recursion.layout, state, model, used)._replace(settled=False)
+        if k == 2_000:
+            early = state
+    assert early is not None
+    np.testing.assert_allclose(state.P, early.P, rtol=1e-9)
+    assert np.linalg.eigvalsh(state.P[:, :, 0]).min() > 1e-4
+    assert np.array_equal(recursion.layout.flip(state.P), state.P)
+
+
+def zip_steps(system: System, count: int) -> list[tuple[StepModel, object]]:
+    models = step_models(system, system.ids)
+    return [next(models) for _ in range(count)]
+
+
+def tracked_target() -> System:
+    """Position and velocity, pushed by white noise; three sensors see the position, with a noise in common."""
+    F = np.array([[1.0, 0.1], [0.0, 1.0]])
+    Q = 0.05 * np.array([[0.1**3 / 3, 0.1**2 / 2], [0.1**2 / 2, 0.1]])
+    return fixed_system(F, Q, dict.fromkeys((1, 2, 3), POSITION), {1: {0: 1.0}, 2: {0: 0.5, -1: 1.0}, 3: {-1: 2.0, 0: 1.0}})
