@@ -32,7 +32,7 @@ from zfusion.drivers.metrics import NodeReport
 from zfusion.drivers.sources import Source, open_source
 from zfusion.drivers.transport import on_zenoh_thread, open_session, publisher
 from zfusion.errors import InputError, MessageError
-from zfusion.messages import Decoder, Reason, decode_any, encode
+from zfusion.messages import Decoder, Reason, decode_any, encode, encode_any
 from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -111,6 +111,8 @@ class LiveNode:
         self._stopping = False
         self._unconfirmed: set[NodeId] = set()
         """Who has not said yet that it has this node's last messages."""
+        self._leaving: set[object] = set()
+        """Who has said that it had put its last messages."""
         self._overheard: Counter[str] = Counter()
         self._strangers: set[NodeId] = set()
         self._decoders: dict[Channel, Decoder] = {}
@@ -380,10 +382,11 @@ class LiveNode:
             self._publish[TRUTH.name](encode(message))
 
     def _query(self, key: str, kind: str, about: NodeId) -> None:
-        """Ask; the answer comes as a notice."""
+        """Ask, and say if this node is leaving; the answer comes as a notice."""
         self._session.get(
             key,
             on_zenoh_thread(lambda reply: self._note(kind, (about, reply))),
+            payload=encode_any({"leaving": self.id} if self._phase is Phase.DONE else {}),
             timeout=ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
@@ -420,6 +423,7 @@ class LiveNode:
 
     def _on_gone(self, j: NodeId) -> None:
         self._meeting.went(j)
+        self._leaving.discard(j)
         self._unconfirmed.discard(j)
         if self._node is None or self._phase is not Phase.RUNNING or j not in self._meeting.hears:
             return
@@ -470,6 +474,9 @@ class LiveNode:
         self._node.learn_history(of, answer.born, answer.end, answer.runs)
 
     def _answer_status(self, query: Any) -> None:
+        asker = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
+        if isinstance(leaving := asker.get("leaving"), int | str):
+            self._leaving.add(leaving)
         query.reply(keys.status_key(self._options.run, self.id), self.status().encode())
 
     def _answer_history(self, query: Any) -> None:
@@ -495,10 +502,10 @@ class LiveNode:
             self._tell(self.status())
 
     def _leave(self, node: Node) -> None:
-        """Tell how it went, and stay until everybody that listens has the last messages.
+        """Tell how it went, and stay until everybody that listens has the last messages, and this node theirs.
 
-        An answer to a query that was put after the last message comes after that message has arrived: links keep
-        the order.
+        An answer to a query that was put after the last message comes after that message has arrived, and so does the
+        query: links keep the order.
         """
         assert self._account is not None  # `_begin` has made it
         self._phase = Phase.DONE
@@ -510,10 +517,14 @@ class LiveNode:
         if self._meeting.recorder:
             self._unconfirmed.add(RECORDER)
             self._query(keys.recorder_status_key(self._options.run), "recorder!", RECORDER)
-        now = time.time_ns()
-        self._tell_status(now)
-        end = now + LEAVE_NS
-        while self._unconfirmed and now < end:
+        self._tell_status(time.time_ns())
+        end = time.time_ns() + LEAVE_NS
+        while (self._unconfirmed or self._speaking()) and time.time_ns() < end:
             self._inbox.rest(end)
             self._handle_notices()
-            now = time.time_ns()
+        self._inbox.drain(self._decoders, self._take)
+
+    def _speaking(self) -> bool:
+        """Whether a neighbour still has something to say, for a node that is to hear the run to its end."""
+        meeting = self._meeting
+        return not self._stopping and not meeting.hears & meeting.present <= self._leaving

@@ -89,8 +89,8 @@ class Meeting:
         """When to begin, if that can be said yet."""
         if self.needs_recorder and not self.recorder:
             return None
-        if joined := self._join_running(now):
-            return joined
+        if begun := self._join_running(now) or self._begin_without_the_rest(now):
+            return begun
         if self.linked <= self.heard.keys() and self.linked <= self.present:
             self.ready[self.own] = self.started_ns
         if self.swarm <= self.ready.keys():
@@ -99,7 +99,7 @@ class Meeting:
                 self.epoch_ns = now + lead
             if self.epoch_ns is not None:
                 return Start(1, self.epoch_ns, self.hears)
-        return self._start_without_the_rest(now)
+        return None
 
     def _join_running(self, now: int) -> Start | None:
         """Begin among nodes that are running already and do not know of this process."""
@@ -114,7 +114,7 @@ class Meeting:
             born = max(1, (now - epoch) // self.period_ns + 1)
         return Start(born, epoch, self.hears & {s.node for s in running})
 
-    def _start_without_the_rest(self, now: int) -> Start | None:
+    def _begin_without_the_rest(self, now: int) -> Start | None:
         """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there."""
         if not self.fixed_epoch or self.epoch_ns is None or self.period_ns is None:
             return None
@@ -126,12 +126,8 @@ class Meeting:
 def check_identity(own: NodeId, identity: tuple[str, int, str], status: Status) -> None:
     """InputError, with both sides, unless a neighbour runs the same scenario on the same version."""
     if status.identity != identity:
-        mine, theirs = (
-            f"scenario {i[2][:12]} on zfusion {i[0]}, wire format {i[1]}" for i in (identity, status.identity)
-        )
-        raise InputError(
-            f"node {status.node} runs {theirs}; this node, {own}, runs {mine}: they cannot be of one swarm"
-        )
+        mine, theirs = (f"scenario {i[2][:12]} on zfusion {i[0]}, format {i[1]}" for i in (identity, status.identity))
+        raise InputError(f"node {status.node} runs {theirs}; node {own}, here, runs {mine}: they are not of one swarm")
 
 
 def hops_from_smallest(swarm: Collection[NodeId], links: Collection[tuple[NodeId, NodeId]]) -> int:

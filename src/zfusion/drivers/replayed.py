@@ -18,9 +18,15 @@ before. Messages are taken as they come and forgotten when nobody needs them any
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from enum import Enum
+from itertools import repeat
+from multiprocessing import get_context
+from operator import itemgetter
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -42,6 +48,10 @@ from zfusion.status import HistoryAnswer
 WAIT_STEPS = 2048
 """Steps of a node that wait for an input that is not on the recording yet, before it counts as missing: recorders
 listen on a link for each node, and one may be ahead of the other by what fits into the links."""
+
+LEAP = 1_000_000
+"""Steps that a message may be ahead of all before it: days of sleep at a few steps a second. What says more is
+somebody's attempt to keep us busy: a node goes through the steps that it slept through one by one."""
 
 TIDY_EVERY = 256
 """Messages of a node after which what nobody needs any more of them is forgotten."""
@@ -106,6 +116,8 @@ class _Life:
         """The last step that was lived again."""
         self.told: dict[int, list[tuple[NodeId, HistoryAnswer]]] = {}
         """By step: histories that were asked for."""
+        self.over = False
+        """It was lived again to its end: a message that comes only now comes too late."""
         self.awaits: _Place | None = None
         """The input that it waits for."""
         self.counters: dict[str, int] = {}
@@ -127,10 +139,23 @@ class _Life:
             insort(self.steps, step)
 
 
-class _Verifier:
-    """Lives all lives of a recording again."""
+@dataclass(slots=True)
+class _Part:
+    """What was found of some of the nodes."""
 
-    def __init__(self, scenario: Scenario, complete: bool, tolerance: float | None) -> None:
+    tallies: dict[NodeId, Tally]
+    lives: int = 0
+    firsts: list[tuple[tuple[int, int, int], Difference]] = field(default_factory=list)
+    """The first difference, if there is one, behind its place: (step, stage, node), as numbers."""
+    missing: list[str] = field(default_factory=list)
+    missing_count: int = 0
+    unreadable: int = 0
+
+
+class _Verifier:
+    """Lives all lives of some of the nodes on a recording again."""
+
+    def __init__(self, scenario: Scenario, nodes: Collection[NodeId], complete: bool, tolerance: float | None) -> None:
         self._scenario, self._complete, self._tolerance = scenario, complete, tolerance
         self._method = METHODS[scenario.method.name]
         self._graph = self._method.network(scenario.network)
@@ -139,22 +164,15 @@ class _Verifier:
         self._published = [*self._stages, ESTIMATE.name]
         self._order = {stage: number for number, stage in enumerate(self._published)}
         self._nobody = _another_id(self._graph.ids)
-        ids = self._graph.ids
-        self._shelves = {node: _Shelf(self._published) for node in ids}
-        self._lives: dict[NodeId, dict[int, _Life]] = {node: {} for node in ids}
-        self._done = dict.fromkeys(ids, 0)
-        self._untidy = dict.fromkeys(ids, 0)
+        self._heard = {j for node in nodes for j in self._graph.neighbours(node)}
+        """The nodes themselves, and those whose messages are their inputs."""
+        self._shelves = {node: _Shelf(self._published) for node in self._heard}
+        self._lives: dict[NodeId, dict[int, _Life]] = {node: {} for node in self._graph.ids}
+        self._newest = 0
+        self._done = dict.fromkeys(nodes, 0)
+        self._untidy = dict.fromkeys(self._heard, 0)
         self._waiting: dict[_Place, list[_Life]] = {}
-        self.tallies = {node: Tally() for node in ids}
-        self.first: Difference | None = None
-        self.missing: list[str] = []
-        self.missing_count = 0
-        self.unreadable = 0
-
-    @property
-    def lives(self) -> int:
-        """Lives of nodes on the recording so far."""
-        return sum(map(len, self._lives.values()))
+        self._part = _Part({node: Tally() for node in nodes})
 
     def taker(self, topic: str) -> Callable[[bytes], None] | None:
         """What takes the messages of a topic in; None where they are of no importance."""
@@ -163,7 +181,7 @@ class _Verifier:
             node = self._scenario.node_id(key.node or "")
         except (MessageError, KeyError):
             return None
-        if key.stage not in self._tables:
+        if key.stage not in self._tables or (node not in self._heard and key.stage != EVENT.name):
             return None
         decode = self._decoder(node, key.stage).decode
         take = self._take_event if key.stage == EVENT.name else self._take_message
@@ -172,16 +190,18 @@ class _Verifier:
             try:
                 take(decode(data))
             except MessageError:
-                self.unreadable += 1
+                self._part.unreadable += node in self._done
 
         return decode_and_take
 
-    def finish(self) -> None:
-        """Nothing more comes: live again what is left."""
-        for lives in self._lives.values():
-            for life in lives.values():
+    def finish(self) -> _Part:
+        """Nothing more comes: live again what is left. What was found."""
+        for node in self._done:
+            for life in self._lives[node].values():
                 self._go_on(life, ended=True)
                 self._settle(life)
+            self._part.lives += len(self._lives[node])
+        return self._part
 
     def _decoder(self, node: NodeId, stage: str) -> Decoder:
         system = self._scenario.system()
@@ -190,12 +210,19 @@ class _Verifier:
 
     def _take_message(self, message: Message) -> None:
         node, stage, step = message.node, message.stage, message.step
+        if step > self._newest + LEAP:
+            raise MessageError(Reason.OUT_OF_RANGE, f"step {step} after {self._newest}")
         life = self._life(node, message.born)
         if step <= life.done or not self._shelves[node].put(message):
             return
-        life.begin(step)
+        self._newest = max(self._newest, step)
         waiters = self._waiting.pop((node, stage, step), ())
-        self._go_on(life)
+        if life.over:
+            self._miss(life, f"{stage} of node {node}, step {step}, in its time: it comes when that life is over")
+            self._part.tallies[node].unverifiable += self._order[stage] > 0
+        elif node in self._done:
+            life.begin(step)
+            self._go_on(life)
         for waiter in waiters:
             waiter.awaits = None
             self._go_on(waiter)
@@ -205,14 +232,17 @@ class _Verifier:
 
     def _take_event(self, message: Message) -> None:
         life = self._life(message.node, message.born)
-        self._settle(life, proven=not self._count(life, message))
+        if message.node in self._done:
+            self._settle(life, proven=not self._count(life, message))
         data = cast("dict[str, object]", message.fields["data"])
         if message.fields["kind"] == "history":
             of = self._neighbour(message.node, data)
             answer = HistoryAnswer.from_map(data, frozenset(self._graph.neighbours(of)))
             life.told.setdefault(message.step, []).append((of, answer))
         elif message.fields["kind"] == "gone":
-            self._take_last_words(self._neighbour(message.node, data), data.get("last"))
+            of = self._neighbour(message.node, data)
+            if of in self._heard:
+                self._take_last_words(of, data.get("last"))
 
     def _neighbour(self, node: NodeId, data: Mapping[str, object]) -> NodeId:
         """The neighbour that an event is about."""
@@ -251,6 +281,7 @@ class _Verifier:
             self._live(life, step, last=ended and not steps)
             life.done = step
             self._done[life.id] = max(self._done[life.id], step)
+        life.over = ended
 
     def _can_go_on(self, life: _Life, step: int) -> bool:
         """Whether the step is over and its inputs are there, or have been waited for long enough."""
@@ -289,7 +320,7 @@ class _Verifier:
     def _finish_former_lives(self, life: _Life) -> None:
         """A life that broke off within a step has that left: live it again while its inputs are still there."""
         for former in self._lives[life.id].values():
-            if former.born < life.born and former.steps:
+            if former.born < life.born and not former.over:
                 self._go_on(former, ended=True)
 
     def _live(self, life: _Life, step: int, last: bool) -> None:
@@ -365,7 +396,7 @@ class _Verifier:
 
     def _judge(self, life: _Life, told: Message, effects: Sequence[Effect]) -> None:
         """Compare what the node says with what it said."""
-        tally, stage = self.tallies[life.id], told.stage
+        tally, stage = self._part.tallies[life.id], told.stage
         again = next(effect for effect in effects if isinstance(effect, Message) and effect.stage == stage)
         found = life.comparison.differs(stage, told.fields, again.fields)
         if found is None:
@@ -382,12 +413,12 @@ class _Verifier:
 
     def _settle(self, life: _Life, proven: bool = True) -> None:
         """Count a life's differences as that, or, where an event is missing that may explain them, as unverifiable."""
-        tally = self.tallies[life.id]
+        tally = self._part.tallies[life.id]
         if proven:
             tally.different += life.differences
-            first = life.first
-            if first is not None and (self.first is None or self._place(first) < self._place(self.first)):
-                self.first = first
+            if life.first is not None:
+                self._part.firsts.append((self._place(life.first), life.first))
+                self._part.firsts = [min(self._part.firsts, key=itemgetter(0))]
         else:
             tally.unverifiable += life.differences
         life.differences, life.first = 0, None
@@ -404,7 +435,7 @@ class _Verifier:
         if lost > 0:
             self._miss(life, f"{lost} x {stage} of node {life.id} before step {message.step}")
             if self._order.get(stage, 0) > 0:
-                self.tallies[life.id].unverifiable += lost
+                self._part.tallies[life.id].unverifiable += lost
         return lost > 0
 
     def _miss(self, life: _Life, what: str, cut_off: bool = False) -> None:
@@ -413,18 +444,18 @@ class _Verifier:
             life.doubt = life.doubt or _Doubt.CUT_OFF
             return
         life.doubt = _Doubt.MISSING
-        self.missing_count += 1
-        if len(self.missing) < NAMED:
-            self.missing.append(what)
+        self._part.missing_count += 1
+        if len(self._part.missing) < NAMED:
+            self._part.missing.append(what)
 
     def _tidy(self, node: NodeId) -> None:
         """Forget messages that all who could use them are past, or that are long over."""
         self._untidy[node] = 0
-        users = (node, *self._graph.listeners(node))
-        self._shelves[node].forget(max(min(self._done[i] for i in users), max(self._done.values()) - 2 * WAIT_STEPS))
+        users = [self._done[i] for i in (node, *self._graph.listeners(node)) if i in self._done]
+        self._shelves[node].forget(max(min(users), max(self._done.values()) - 2 * WAIT_STEPS))
 
 
-def verify(recording: Recording, *, tolerance: float | None = None) -> Verdict:
+def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 1) -> Verdict:
     """Recompute every intermediate and final estimate on a recording, of all nodes and lives, and compare.
 
     Bit for bit; where the recording was made with other versions or on another kind of machine (`Verdict.arithmetic`
@@ -432,29 +463,48 @@ def verify(recording: Recording, *, tolerance: float | None = None) -> Verdict:
     recomputed because an input is missing is counted, and named, as that; what the end of a recording that was
     broken off leaves open, as that.
 
-    Reads the recording once, in memory that does not grow with its length. ScenarioError if its scenario cannot be
-    read by this version, InputError if it does not know the method, RecordingError if the file has changed.
+    Reads the recording once, in memory that does not grow with its length; with `jobs` > 1, so many processes do so,
+    each for some of the nodes. ScenarioError if its scenario cannot be read by this version, InputError if it does not
+    know the method, RecordingError if the file has changed.
     """
     scenario = recorded_scenario(recording)
     arithmetic = arithmetic_differences(recording.metadata)
     if tolerance is None and arithmetic:
         tolerance = TOLERANCE
-    verifier = _Verifier(scenario, recording.complete, tolerance)
-    takers = {topic: take for topic in recording.topics if (take := verifier.taker(topic)) is not None}
-    for record in recording.records(takers):
-        takers[record.topic](record.data)
-    verifier.finish()
+    jobs = max(1, min(jobs, len(scenario.ids)))
+    if jobs == 1:
+        parts = [_verify_some(recording, scenario, scenario.ids, tolerance)]
+    else:
+        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            shares = [scenario.ids[n::jobs] for n in range(jobs)]
+            parts = list(pool.map(_verify_file, repeat(recording.path), shares, repeat(tolerance)))
+    tallies = {node: tally for part in parts for node, tally in part.tallies.items()}
+    missing = [what for part in parts for what in part.missing]
     return Verdict(
-        nodes=verifier.tallies,
-        lives=verifier.lives,
-        first=verifier.first,
-        missing=tuple(verifier.missing),
-        missing_count=verifier.missing_count,
-        unreadable=verifier.unreadable,
+        nodes={node: tallies[node] for node in scenario.ids},
+        lives=sum(part.lives for part in parts),
+        first=min((first for part in parts for first in part.firsts), key=itemgetter(0), default=(None, None))[1],
+        missing=tuple(missing[:NAMED]),
+        missing_count=sum(part.missing_count for part in parts),
+        unreadable=sum(part.unreadable for part in parts),
         arithmetic=arithmetic,
         tolerance=tolerance,
         note=recording.note,
     )
+
+
+def _verify_file(path: Path, nodes: Sequence[NodeId], tolerance: float | None) -> _Part:
+    """What a process of its own does."""
+    with Recording.open(path) as recording:
+        return _verify_some(recording, recorded_scenario(recording), nodes, tolerance)
+
+
+def _verify_some(recording: Recording, scenario: Scenario, nodes: Sequence[NodeId], tolerance: float | None) -> _Part:
+    verifier = _Verifier(scenario, nodes, recording.complete, tolerance)
+    takers = {topic: take for topic in recording.topics if (take := verifier.taker(topic)) is not None}
+    for record in recording.records(takers):
+        takers[record.topic](record.data)
+    return verifier.finish()
 
 
 def recorded_scenario(recording: Recording) -> Scenario:

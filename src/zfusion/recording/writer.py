@@ -59,7 +59,7 @@ class RecordingWriter:
         facts: Mapping[str, str] | None = None,
     ) -> None:
         self.is_legal: Callable[[str, bytes], bool] = lambda _topic, _data: True
-        """Asked, with topic and payload, where a message's counters are not the next in order: not legal, not counted."""
+        """Asked, with topic and payload, where counters are not the next in order: what is not legal does not count."""
         self.path = Path(path)
         self._stages = {stage.name: stage for stage in (*BUILT_IN, *stages)}
         self._schemas: dict[Stage | None, int] = {}

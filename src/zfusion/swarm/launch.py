@@ -83,6 +83,7 @@ class RunResult:
     failures: list[str]
     """What went wrong, in words; empty where nothing did."""
     interrupted: bool
+    """Stopped before its end."""
     elapsed_s: float
     logs: Path
 
@@ -142,7 +143,7 @@ class Launcher:
             reports={node: [NodeReport(**r) for r in child.reports] for node, child in self._nodes.items()},
             recorder=self._recorder_report(),
             failures=self._failures,
-            interrupted=self._interrupts > 0,
+            interrupted=self._stop_by is not None,
             elapsed_s=time.monotonic() - began,
             logs=self._options.logs,
         )

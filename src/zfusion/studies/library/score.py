@@ -39,10 +39,10 @@ HELD_OUT_COLUMNS = {
     "all nodes": "nodes",
     "worst node": "worst",
     "alone": "alone",
-    "mean of motes": "mean",
-    "mean, corrected": "corrected_mean",
-    "nearest mote": "nearest",
-    "last in training": "last",
+    "mean": "mean",
+    "mean + offset": "corrected_mean",
+    "nearest": "nearest",
+    "last value": "last",
 }
 """Headings of the tables, and the attributes that stand below them."""
 
@@ -288,19 +288,19 @@ def show_score(console: Console, result: Score) -> None:
     console.print(
         f"{result.rounds} rounds after {result.training} of training, {result.method}; root mean square errors in °C"
     )
-    for title, rows, columns in (
-        ("next reading of the motes in the swarm", result.next_reading, NEXT_COLUMNS),
-        ("readings of the motes that were held out", result.held_out, HELD_OUT_COLUMNS),
+    for title, rows, columns, digits in (
+        ("next reading of the motes in the swarm", result.next_reading, NEXT_COLUMNS, 4),
+        ("readings of the motes that were held out", result.held_out, HELD_OUT_COLUMNS, 3),
     ):
         table = Table(title=title, title_justify="left")
         for heading in ("mote", *columns):
             table.add_column(heading, justify="right")
         for row in rows:
-            table.add_row(str(row.mote), *(_shown(getattr(row, name)) for name in columns.values()))
+            table.add_row(str(row.mote), *(_shown(getattr(row, name), digits) for name in columns.values()))
         table.add_section()
-        table.add_row("all", *(_shown(_together(rows, name)) for name in columns.values()))
+        table.add_row("all", *(_shown(_together(rows, name), digits) for name in columns.values()))
         console.print(table)
 
 
-def _shown(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.4f}"
+def _shown(value: float, digits: int) -> str:
+    return "–" if np.isnan(value) else f"{value:.{digits}f}"

@@ -1,0 +1,223 @@
+"""The commands as a user and a program meet them, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from oracles.paper import ERROR_VARIANCES
+
+ROOT = Path(__file__).parents[1]
+FOUR = str(ROOT / "examples" / "four_sensor.toml")
+
+
+def zfusion(*arguments: str, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "zfusion", *arguments], cwd=cwd, capture_output=True, text=True, timeout=90, check=False
+    )
+    assert done.returncode == code, f"{arguments}: exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def told(*arguments: str, cwd: Path, code: int = 0) -> dict[str, Any]:
+    """What a command prints with --json: one JSON object and nothing else."""
+    result = json.loads(zfusion(*arguments, "--json", cwd=cwd, code=code).stdout)
+    assert isinstance(result, dict)
+    return result
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("simulated")
+    zfusion("simulate", FOUR, "--steps", "120", "--record", "run.mcap", "--run", "run", cwd=directory)
+    return directory / "run.mcap"
+
+
+def test_design_is_the_papers_table(tmp_path: Path) -> None:
+    design = told("design", FOUR, "--steps", "100", cwd=tmp_path)
+    assert design["nodes"] == [1, 2, 3, 4]
+    assert design["steps"] == 100
+    covariances = design["error_covariance"]
+    for step, row in ERROR_VARIANCES.items():
+        for kind in ("local", "intermediate", "distributed"):
+            computed = np.array(covariances[kind][step])
+            assert computed.shape == (4, 1, 1)
+            np.testing.assert_allclose(computed[:, 0, 0], row[kind], atol=1e-9, rtol=0)
+        np.testing.assert_allclose(covariances["centralized"][step], [[row["centralized"][0]]], atol=1e-9, rtol=0)
+    assert covariances["local"][0] == [[[1.0]]] * 4
+    assert "centralized" in zfusion("design", FOUR, "--steps", "5", cwd=tmp_path).stdout
+
+
+def test_simulate_tells_what_launch_tells(tmp_path: Path) -> None:
+    summary = told("simulate", FOUR, "--steps", "50", "--run", "s", cwd=tmp_path)
+    assert summary["run"] == "s"
+    assert summary["method"] == "two_stage"
+    assert summary["completed_steps"] == {"1": 50, "2": 50, "3": 50, "4": 50}
+    assert summary["messages"]["sent"]["estimate"] == 200
+    assert summary["messages"]["recorded"]["estimate"] == 200
+    assert summary["lost"] == summary["late"] == 0
+    assert set(summary["rmse"]) == {"intermediate", "estimate"}
+    assert Path(summary["recording"]) == tmp_path / "recordings" / "s.mcap"
+
+
+def test_simulating_twice_is_the_same(tmp_path: Path) -> None:
+    first = told("simulate", FOUR, "--steps", "30", "--no-record", "--run", "s", cwd=tmp_path)
+    assert told("simulate", FOUR, "--steps", "30", "--no-record", "--run", "s", cwd=tmp_path) == first
+    other = told("simulate", FOUR, "--steps", "30", "--no-record", "--run", "s", "--seed", "99", cwd=tmp_path)
+    assert other["rmse"] != first["rmse"]
+
+
+def test_loss_is_counted_and_the_recording_still_verifies(tmp_path: Path) -> None:
+    arguments = ("simulate", FOUR, "--steps", "100", "--loss", "0.2", "--record", "lossy.mcap")
+    summary = told(*arguments, cwd=tmp_path)
+    assert summary["lost"] > 50
+    assert summary["missed"] >= summary["lost"]
+    assert told("replay", "lossy.mcap", "--verify", cwd=tmp_path)["different"] == 0
+
+
+def test_replay_verifies(simulated: Path) -> None:
+    verdict = told("replay", str(simulated), "--verify", cwd=simulated.parent)
+    assert (verdict["identical"], verdict["different"], verdict["unverifiable"]) == (2 * 4 * 120, 0, 0)
+    assert "960 identical, 0 different" in zfusion("replay", str(simulated), "--verify", cwd=simulated.parent).stdout
+
+
+def test_replay_names_the_first_difference(simulated: Path, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    changed = tmp_path / "changed.mcap"
+    with simulated.open("rb") as source, changed.open("wb") as target:
+        reader = make_reader(source)
+        writer = Writer(target, compression=CompressionType.NONE)
+        writer.start(profile=reader.get_header().profile)
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        for found in reader.iter_attachments():
+            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+        numbers: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic not in numbers:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            data = message.data
+            if channel.topic.endswith("/node/3/estimate"):
+                payload = msgpack.unpackb(data)
+                if payload["step"] == 77:
+                    payload["x"][0] = float(np.nextafter(payload["x"][0], 9e9))
+                    data = msgpack.packb(payload)
+            writer.add_message(
+                numbers[channel.topic], message.log_time, data, message.publish_time, message.sequence
+            )
+        writer.finish()
+    verdict = told("replay", str(changed), "--verify", cwd=tmp_path, code=1)
+    assert verdict["different"] == 1
+    first = verdict["first_difference"]
+    assert (first["node"], first["step"], first["stage"], first["field"], first["ulps"]) == (3, 77, "estimate", "x", 1)
+
+
+def test_replay_runs_the_measurements_through_another_method(simulated: Path, tmp_path: Path) -> None:
+    arguments = ("replay", str(simulated), "--method", "centralized", "-o", "new/central.mcap")
+    compared = told(*arguments, cwd=tmp_path)
+    assert set(compared["nodes"]) == {"1", "2", "3", "4"}
+    assert all(node["compared"] == 120 for node in compared["nodes"].values())
+    rerun = told("info", "new/central.mcap", cwd=tmp_path)
+    assert rerun["method"] == "centralized"
+    assert told("replay", "new/central.mcap", "--verify", cwd=tmp_path)["different"] == 0
+
+
+def test_info_and_export(simulated: Path, tmp_path: Path) -> None:
+    facts = told("info", str(simulated), cwd=tmp_path)
+    assert facts["run"] == "run"
+    assert facts["complete"] is True
+    assert facts["lost"] == 0
+    for format in ("csv", "jsonl", "npz"):
+        done = told("export", str(simulated), "-f", format, "-o", f"run.{format}", cwd=tmp_path)
+        assert done["messages"] == facts["messages"]
+        assert (tmp_path / f"run.{format}").stat().st_size > 1000
+    assert "node/1/estimate" in zfusion("info", str(simulated), cwd=tmp_path).stdout
+
+
+SCENARIO = """
+name = "tiny"
+[system]
+F = 1.0
+Q = 0.01
+initial_covariance = 1.0
+[[sensors]]
+id = 1
+H = 1.0
+R = 1.0
+[network]
+matrix = [[1]]
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("F = 1.0", "F = 1.0\nG = 2"), "system.G"),
+        (("Q = 0.01", "Q = -0.01"), "system.Q"),
+        (("matrix = [[1]]", "matrix = [[0]]"), "network.matrix"),
+        (("matrix = [[1]]", "matrix = [[1, 0]]"), "network.matrix"),
+        (("R = 1.0", "R = [[1, 2], [3, 4]]"), "sensors[0].R"),
+        (("H = 1.0", "H = [[1.0, 0.0]]"), "sensors[0].H"),
+        (('name = "tiny"', 'method = "magic"'), "method"),
+        (('name = "tiny"', 'timing = { deadlines = { lunch = 0.5 } }'), "timing.deadlines.lunch"),
+        (("F = 1.0", "F = "), "tiny.toml"),
+    ],
+)
+def test_a_scenario_that_is_wrong_is_refused_in_a_line(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+    (tmp_path / "tiny.toml").write_text(SCENARIO.replace(*change))
+    for command in ("launch", "simulate", "design"):
+        done = zfusion(command, "tiny.toml", cwd=tmp_path, code=2)
+        assert said in done.stderr
+        assert len(done.stderr.strip().splitlines()) <= 2
+        assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("info", "nothing.mcap"), "nothing.mcap"),
+        (("replay", "nothing.mcap", "--verify"), "nothing.mcap"),
+        (("replay", "text.mcap", "--verify"), "text.mcap"),
+        (("launch", "nothing.toml"), "nothing.toml"),
+        (("node", FOUR, "--id", "9"), "--id"),
+        (("node", FOUR, "--id", "1", "--epoch", "soon"), "--epoch"),
+        (("launch", FOUR, "--run", "a/b"), "a/b"),
+        (("launch", FOUR, "--steps", "0"), "--steps"),
+        (("launch", FOUR, "--method", "magic"), "magic"),
+        (("simulate", FOUR, "--record", "/proc/nowhere/x.mcap"), "/proc/nowhere"),
+        (("export", "text.mcap"), "text.mcap"),
+        (("frobnicate",), "frobnicate"),
+    ],
+)
+def test_bad_usage_is_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    (tmp_path / "text.mcap").write_text("this is not a recording\n" * 10)
+    assert said in zfusion(*arguments, cwd=tmp_path, code=2).stderr
+
+
+def test_a_truncated_recording_is_verified_as_far_as_it_goes(simulated: Path, tmp_path: Path) -> None:
+    whole = simulated.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    verdict = told("replay", "cut.mcap", "--verify", cwd=tmp_path)
+    assert verdict["different"] == 0
+    assert verdict["identical"] > 0
+    assert verdict["note"]
+
+
+def test_a_damaged_recording_is_refused(simulated: Path, tmp_path: Path) -> None:
+    damaged = bytearray(simulated.read_bytes())
+    damaged[len(damaged) // 2] ^= 0x55
+    (tmp_path / "damaged.mcap").write_bytes(damaged)
+    assert "damaged" in zfusion("replay", "damaged.mcap", "--verify", cwd=tmp_path, code=2).stderr

@@ -1,0 +1,241 @@
+"""The inbox: every wait ends, no message is lost, and the bell is heard by nobody else."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.inbox import STRETCH_NS, Inbox, Wake
+from zfusion.drivers.transport import open_session
+from zfusion.swarm.launch import free_endpoints
+
+from swarms import wait_until
+
+SOON_NS = 20_000_000_000
+"""Far later than anything here takes; a wait that lasts until then has not been ended."""
+
+
+class Pair:
+    """Two linked sessions, an inbox in one of them."""
+
+    def __init__(self) -> None:
+        [endpoint] = free_endpoints(1)
+        self.session = open_session(Endpoints(listen=(endpoint,)))
+        self.peer = open_session(Endpoints(connect=(endpoint,)))
+        self.inbox = Inbox(self.session)
+        self.closed = False
+
+    def subscribe(self, *names: str, capacity: int = 1000) -> None:
+        """Channels that the peer knows of."""
+        for name in names:
+            self.inbox.subscribe(name, f"test/{name}", capacity)
+        token = self.session.liveliness().declare_token("test/token")
+        watch = self.peer.liveliness().declare_subscriber("test/token", zenoh.handlers.FifoChannel(4), history=True)
+        wait_until(watch.handler.try_recv, "the link")
+        token.undeclare()
+        watch.undeclare()
+
+    def put(self, name: str, data: bytes) -> None:
+        self.peer.put(f"test/{name}", data, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def next(self, name: str) -> bytes:
+        """The next message, however often the wait is ended by something else."""
+        end = time.time_ns() + SOON_NS
+        while time.time_ns() < end:
+            data = self.inbox.wait(name, end)
+            if data is not None:
+                return data
+            self.inbox.notices.clear()
+        pytest.fail(f"nothing came on {name}")
+
+    def close(self) -> float:
+        """Close everything; how long that took, in seconds."""
+        began = time.monotonic()
+        if not self.closed:
+            self.closed = True
+            self.inbox.close()
+            self.session.close()
+            self.peer.close()
+        return time.monotonic() - began
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    pair = Pair()
+    yield pair
+    pair.close()
+
+
+def test_a_message_ends_a_wait(pair: Pair) -> None:
+    pair.subscribe("a")
+    pair.put("a", b"one")
+    assert pair.next("a") == b"one"
+    threading.Timer(0.05, pair.put, ("a", b"two")).start()
+    assert pair.next("a") == b"two"
+    assert pair.inbox.poll("a") is None
+
+
+def test_a_deadline_ends_a_wait(pair: Pair) -> None:
+    pair.subscribe("a")
+    for wait_ns in (2_000_000, 50_000_000):
+        deadline = time.time_ns() + wait_ns
+        while time.time_ns() < deadline:
+            assert pair.inbox.wait("a", deadline) is None
+        assert time.time_ns() - deadline < 2_000_000_000
+    assert pair.inbox.wait("a", time.time_ns() - 1) is None  # one that is over already
+
+
+def test_a_long_wait_is_ended_for_a_change(pair: Pair) -> None:
+    pair.subscribe("a")
+    for deadline in (None, time.time_ns() + SOON_NS):
+        began = time.time_ns()
+        assert pair.inbox.wait("a", deadline) is None
+        assert STRETCH_NS / 2 < time.time_ns() - began < 5_000_000_000
+
+
+def test_a_notice_ends_a_wait(pair: Pair) -> None:
+    pair.subscribe("a")
+    for number in range(20):
+        threading.Timer(0.001 * (number % 3), pair.inbox.notify, (number,)).start()
+        end = time.time_ns() + SOON_NS
+        while not pair.inbox.notices:
+            assert time.time_ns() < end
+            assert pair.inbox.wait("a", end) is None
+        assert pair.inbox.notices.popleft() == number
+
+
+def test_a_notice_that_is_there_lets_nobody_wait(pair: Pair) -> None:
+    pair.subscribe("a")
+    pair.inbox.notify("note")
+    assert pair.inbox.wait("a", None) is None
+    assert not pair.inbox.rest(time.time_ns() + SOON_NS)
+    pair.put("a", b"message")
+    wait_until(lambda: pair.inbox.wait("a", None) == b"message", "a message comes through all the same")
+
+
+def test_rest_ends_with_its_time_or_a_notice(pair: Pair) -> None:
+    until = time.time_ns() + 30_000_000
+    assert pair.inbox.rest(until)
+    assert 0 <= time.time_ns() - until < 2_000_000_000
+    assert pair.inbox.rest(time.time_ns() - 1)
+    threading.Timer(0.02, pair.inbox.notify, ("note",)).start()
+    assert not pair.inbox.rest(time.time_ns() + SOON_NS)
+    assert list(pair.inbox.notices) == ["note"]
+
+
+def test_notify_may_be_used_in_a_signal_handler_at_any_moment(pair: Pair) -> None:
+    pair.subscribe("a")
+    before = signal.signal(signal.SIGALRM, lambda *_: pair.inbox.notify("alarm"))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.001, 0.0007)
+        heard = 0
+        end = time.time_ns() + SOON_NS
+        while heard < 300:
+            assert time.time_ns() < end
+            if heard % 2:
+                pair.inbox.rest(end)
+            else:
+                pair.inbox.wait("a", end)
+            heard += len(pair.inbox.notices)
+            pair.inbox.notices.clear()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_nothing_is_lost_or_reordered_whatever_ends_the_waits(pair: Pair) -> None:
+    pair.subscribe("a", "b", capacity=64)
+    count = 4000
+    noise = threading.Event()
+
+    def talk(name: str) -> None:
+        for number in range(count):
+            pair.put(name, b"%d" % number)
+
+    def disturb() -> None:
+        while not noise.wait(0.0005):
+            pair.inbox.notify("noise")
+
+    threads = [threading.Thread(target=talk, args=(name,)) for name in ("a", "b")]
+    threads.append(threading.Thread(target=disturb))
+    for thread in threads:
+        thread.start()
+    heard: dict[str, list[bytes]] = {"a": [], "b": []}
+    end = time.monotonic() + 60
+    turn = 0
+    while any(len(messages) < count for messages in heard.values()):
+        assert time.monotonic() < end, {name: len(messages) for name, messages in heard.items()}
+        turn += 1
+        data = pair.inbox.wait("ab"[turn % 2], time.time_ns() + turn % 5 * 100_000)
+        if data is not None:
+            heard["ab"[turn % 2]].append(data)
+        pair.inbox.notices.clear()
+        if turn % 7 == 0:
+            pair.inbox.drain(("a", "b"), lambda name, data: heard[name].append(data))
+    noise.set()
+    for thread in threads:
+        thread.join()
+    assert heard == {name: [b"%d" % number for number in range(count)] for name in ("a", "b")}
+    assert pair.inbox.poll("a") is None
+    assert pair.inbox.poll("b") is None
+
+
+def test_a_full_channel_does_not_keep_another_one_waiting_for_ever(pair: Pair) -> None:
+    pair.subscribe("full", "other", capacity=8)
+    for number in range(100):
+        pair.put("full", b"%d" % number)
+    pair.put("other", b"behind")
+    end = time.time_ns() + SOON_NS
+    heard: list[bytes] = []
+    found = None
+    while found is None:
+        assert time.time_ns() < end
+        found = pair.inbox.wait("other", end)
+        pair.inbox.drain(["full"], lambda _, data: heard.append(data))
+    assert found == b"behind"
+    assert heard[:90] == [b"%d" % number for number in range(90)]
+
+
+def test_closing_with_full_channels_is_quick(pair: Pair) -> None:
+    pair.subscribe("a", "b", capacity=4)
+    for number in range(50):
+        pair.put("a", b"%d" % number)
+        pair.put("b", b"%d" % number)
+    wait_until(lambda: pair.inbox.poll("a"), "the channels fill up")
+    assert pair.close() < 5.0
+
+
+def test_an_expression_has_its_bell_on_a_key_of_its_own(pair: Pair) -> None:
+    pair.inbox.subscribe("all", "test/**", 100, bell="test/bell")
+    pair.subscribe()
+    sample = pair.inbox.wait_sample("all", time.time_ns() + 1_000_000)
+    assert str(sample.key_expr) == "test/bell"
+    pair.put("x", b"message")
+    wait_until(lambda: pair.inbox.poll("all") == b"message", "a message")
+
+
+def test_a_bell_does_not_leave_the_session(pair: Pair) -> None:
+    pair.subscribe("a")
+    overheard = pair.peer.declare_subscriber("test/**", zenoh.handlers.FifoChannel(100))
+    for _ in range(5):
+        pair.inbox.wait("a", time.time_ns() + 1_000_000)
+    pair.put("a", b"end")
+    assert pair.next("a") == b"end"
+    assert overheard.handler.recv().payload.to_bytes() == b"end"  # the peer's own, and nothing before it
+    overheard.undeclare()
+
+
+def test_a_wake_that_is_set_before_the_wait_ends_it_once() -> None:
+    wake = Wake()
+    wake.set()
+    wake.set()
+    wake.wait(60)
+    began = time.monotonic()
+    wake.wait(0.02)
+    assert time.monotonic() - began >= 0.02
