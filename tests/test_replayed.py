@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 from random import Random
@@ -91,6 +92,24 @@ def test_everything_is_identical(tmp_path: Path, scenario: Scenario, link: Link)
     verdict = assert_all_identical(path, stages * scenario.steps * len(scenario.ids))
     assert verdict.lives == len(scenario.ids)
     assert verdict.tolerance is None
+
+
+def test_several_processes_find_what_one_does(tmp_path: Path) -> None:
+    def tell(simulation: Simulation) -> None:
+        simulation.run(EPOCH_NS + 6 * 20 * MS + 5 * MS)
+        simulation.kill(20)
+        simulation.run(EPOCH_NS + 8 * 20 * MS + 5 * MS)
+        simulation.revive(20)
+
+    path = tmp_path / "r.mcap"
+    record_story(path, walk(15), tell, by_rule(lambda edge, _: 4 * MS))
+    short = without(path, tmp_path / "x.mcap", (20, "measurement", 3), (20, "measurement", 6))
+    wrong = altered(short, tmp_path / "y.mcap", (40, "estimate", 2), lambda p: {"x": [0.0, p["x"][1]]})
+    one, two = verdict_on(wrong), verdict_on(wrong, jobs=2)
+    assert set(one.missing) == set(two.missing)
+    assert replace(one, missing=()).as_dict() == replace(two, missing=()).as_dict()
+    assert one.different == 1
+    assert one.lives == 6
 
 
 def test_histories_that_were_asked_for_are_identical_too(tmp_path: Path) -> None:
@@ -370,6 +389,47 @@ def test_garbage_repetitions_and_strangers_change_nothing(tmp_path: Path) -> Non
     verdict = verdict_on(rewrite(path, tmp_path / "x.mcap", disturbed))
     assert (verdict.different, verdict.unverifiable, verdict.identical) == (0, 0, 2 * 10 * 5)
     assert verdict.unreadable > 10
+
+
+def test_a_message_from_the_far_future_keeps_nobody_busy(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", walk(6))
+
+    def forged(old: Record) -> list[Record]:
+        payload = decode_any(old.data)
+        if payload["step"] != 4 or "event" in old.topic or "truth" in old.topic:
+            return [old]
+        return [old, *(old._replace(data=encode_any(payload | {"step": 2**53 - 1, "born": b})) for b in (1, 2**53 - 1))]
+
+    verdict = verdict_on(rewrite(path, tmp_path / "x.mcap", forged))
+    assert (verdict.identical, verdict.different, verdict.unverifiable) == (2 * 6 * 5, 0, 0)
+    assert verdict.unreadable == 2 * 3 * 5
+
+
+def test_a_former_life_that_speaks_up_when_the_next_has_begun(tmp_path: Path) -> None:
+    """Its last estimate comes to the recorder seconds later than it should: it is not verified, and said so."""
+
+    def tell(simulation: Simulation) -> None:
+        simulation.run(EPOCH_NS + 6 * 20 * MS + 1)
+        simulation.kill(20)
+        simulation.revive(20)
+
+    path = tmp_path / "r.mcap"
+    record_story(path, walk(12), tell)
+    late = rewritten_in_order(
+        path,
+        tmp_path / "x.mcap",
+        lambda r: r.topic.endswith("/20/estimate") and decode_any(r.data)["step"] == 6,
+    )
+    verdict = verdict_on(late)
+    assert (verdict.different, verdict.unverifiable) == (0, 0)  # it belongs to a step that is over: nobody misses it
+    assert verdict.identical == 2 * 12 * 5 - 1
+    silent = rewrite(path, tmp_path / "y.mcap", lambda r: [] if decode_any(r.data).get("kind") == "gone" else [r])
+    verdict = verdict_on(
+        rewritten_in_order(silent, tmp_path / "z.mcap", lambda r: "/20/" in r.topic and decode_any(r.data)["step"] == 6)
+    )
+    assert verdict.different == 0
+    assert verdict.nodes[20].unverifiable == 2
+    assert any("when that life is over" in what for what in verdict.missing)
 
 
 def test_two_different_messages_of_one_step_leave_it_open_which_was_used(tmp_path: Path) -> None:

@@ -438,7 +438,7 @@ def test_what_matters_to_a_run_is_in_the_fingerprint(changes):
 def test_the_fingerprint_is_the_same_in_every_process():
     """Nodes compare it across machines: a changed value is a changed protocol, and needs another version in it."""
     fingerprint = load_scenario(EXAMPLES / "four_sensor.toml").fingerprint
-    assert fingerprint == "6449d0d194dcac5d339525ac6c2f5a0eeb13cd25fb596e48f6940ed0fe313238"
+    assert fingerprint == "25ebd0c9eea262c2604e9caaaee6062b7f457b76d9e74f3e232ecf14ed0fafdc"
 
 
 # --- what is wrong is said, where and how ---

@@ -123,7 +123,7 @@ def simulate(
     if path is not None:
         with Recording.open(path) as recording:
             recorded = RecorderReport.of(recording)
-    summary = summarize(name, loaded, reports, recorded)
+    summary = summarize(name, loaded, reports, recorded, simulated=True)
     finish(summary, as_json, lambda: show_summary(out, summary))
 
 

@@ -17,12 +17,10 @@ before. Messages are taken as they come and forgotten when nobody needs them any
 
 from __future__ import annotations
 
-from bisect import insort
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import Enum
 from itertools import repeat
 from multiprocessing import get_context
 from operator import itemgetter
@@ -32,7 +30,8 @@ from typing import cast
 import numpy as np
 
 from zfusion import keys
-from zfusion.drivers.verdict import EXACT, NAMED, TOLERANCE, Comparison, Difference, Tally, Verdict
+from zfusion.drivers.lives import Doubt, Life, Place, Shelf
+from zfusion.drivers.verdict import NAMED, TOLERANCE, Difference, Tally, Verdict
 from zfusion.errors import InputError, MessageError
 from zfusion.gaps import MAX_LIVES
 from zfusion.messages import Decoder, Reason, encode_any
@@ -56,87 +55,8 @@ somebody's attempt to keep us busy: a node goes through the steps that it slept 
 TIDY_EVERY = 256
 """Messages of a node after which what nobody needs any more of them is forgotten."""
 
-_Place = tuple[NodeId, str, int]
-"""(sender, stage, step)."""
-
-
-class _Doubt(Enum):
-    """Why a difference proves nothing."""
-
-    MISSING = "something that should be on the recording is not"
-    CUT_OFF = "the recording ends before something that it depends on"
-
-
-class _Shelf:
-    """The messages of one node that somebody may still need, by stage and step."""
-
-    def __init__(self, stages: Iterable[str]) -> None:
-        self.by_stage: dict[str, dict[int, Message]] = {stage: {} for stage in stages}
-        self.disputed: set[tuple[str, int]] = set()
-        """(stage, step) of which there are two that differ: of two lives, or because somebody else spoke too."""
-        self._second: dict[tuple[str, int, int], Message] = {}
-        """By stage, step and life: those of a second life at a step."""
-
-    def put(self, message: Message) -> bool:
-        """Keep a message; False if it is there already. Of two of one life the first counts, as it does for nodes."""
-        stage, step = message.stage, message.step
-        known = self.by_stage[stage].setdefault(step, message)
-        if known is message:
-            return True
-        if known.born == message.born:
-            if EXACT.differs(stage, known.fields, message.fields):
-                self.disputed.add((stage, step))
-            return False
-        self.disputed.add((stage, step))
-        return self._second.setdefault((stage, step, message.born), message) is message
-
-    def said(self, stage: str, step: int, born: int) -> Message | None:
-        """What the node said in the life that began at `born`."""
-        message = self.by_stage[stage].get(step)
-        return message if message is None or message.born == born else self._second.get((stage, step, born))
-
-    def forget(self, floor: int) -> None:
-        """Drop what is of steps up to `floor`."""
-        for stage, messages in self.by_stage.items():
-            self.by_stage[stage] = {step: message for step, message in messages.items() if step > floor}
-        self.disputed = {place for place in self.disputed if place[1] > floor}
-        self._second = {place: message for place, message in self._second.items() if place[1] > floor}
-
-
-class _Life:
-    """One life of a node: how far it was lived again."""
-
-    def __init__(self, node: NodeId, born: int, tolerance: float | None) -> None:
-        self.id, self.born = node, born
-        self.node: Node | None = None
-        """Made when the first step is lived again."""
-        self.steps: list[int] = []
-        """Begun, and not lived again yet; ascending."""
-        self.done = born - 1
-        """The last step that was lived again."""
-        self.told: dict[int, list[tuple[NodeId, HistoryAnswer]]] = {}
-        """By step: histories that were asked for."""
-        self.over = False
-        """It was lived again to its end: a message that comes only now comes too late."""
-        self.awaits: _Place | None = None
-        """The input that it waits for."""
-        self.counters: dict[str, int] = {}
-        """By stage: the number of the next message."""
-        self.heard: dict[NodeId, int] = {}
-        """The neighbours' lives that it has heard."""
-        self.doubt: _Doubt | None = None
-        self.differences = 0
-        """Since its last event: they count only if that which follows shows that no event is missing."""
-        self.first: Difference | None = None
-        """Of them, that of the lowest step."""
-        self.comparison = Comparison(tolerance)
-
-    def begin(self, step: int) -> None:
-        """A message of `step` is there."""
-        if not self.steps or step > self.steps[-1]:
-            self.steps.append(step)
-        elif step not in self.steps:
-            insort(self.steps, step)
+_Order = tuple[int, int, int]
+"""(step, stage, node), all as numbers."""
 
 
 @dataclass(slots=True)
@@ -145,11 +65,16 @@ class _Part:
 
     tallies: dict[NodeId, Tally]
     lives: int = 0
-    firsts: list[tuple[tuple[int, int, int], Difference]] = field(default_factory=list)
-    """The first difference, if there is one, behind its place: (step, stage, node), as numbers."""
+    first: tuple[_Order, Difference] | None = None
+    """The first difference, and its place among all."""
     missing: list[str] = field(default_factory=list)
     missing_count: int = 0
     unreadable: int = 0
+
+    def note(self, place: _Order, difference: Difference) -> None:
+        """A difference was found."""
+        if self.first is None or place < self.first[0]:
+            self.first = (place, difference)
 
 
 class _Verifier:
@@ -166,12 +91,12 @@ class _Verifier:
         self._nobody = _another_id(self._graph.ids)
         self._heard = {j for node in nodes for j in self._graph.neighbours(node)}
         """The nodes themselves, and those whose messages are their inputs."""
-        self._shelves = {node: _Shelf(self._published) for node in self._heard}
-        self._lives: dict[NodeId, dict[int, _Life]] = {node: {} for node in self._graph.ids}
+        self._shelves = {node: Shelf(self._published) for node in self._heard}
+        self._lives: dict[NodeId, dict[int, Life]] = {node: {} for node in self._graph.ids}
         self._newest = 0
         self._done = dict.fromkeys(nodes, 0)
         self._untidy = dict.fromkeys(self._heard, 0)
-        self._waiting: dict[_Place, list[_Life]] = {}
+        self._waiting: dict[Place, list[Life]] = {}
         self._part = _Part({node: Tally() for node in nodes})
 
     def taker(self, topic: str) -> Callable[[bytes], None] | None:
@@ -260,16 +185,16 @@ class _Verifier:
                     if self._shelves[node].said(stage, message.step, message.born) is None:
                         self._take_message(message)
 
-    def _life(self, node: NodeId, born: int) -> _Life:
+    def _life(self, node: NodeId, born: int) -> Life:
         lives = self._lives[node]
         life = lives.get(born)
         if life is None:
             if len(lives) == MAX_LIVES:
                 raise MessageError(Reason.OUT_OF_RANGE, f"more than {MAX_LIVES} lives")
-            life = lives[born] = _Life(node, born, self._tolerance)
+            life = lives[born] = Life(node, born, self._tolerance)
         return life
 
-    def _go_on(self, life: _Life, ended: bool = False) -> None:
+    def _go_on(self, life: Life, ended: bool = False) -> None:
         """Live the steps again that can be: those of which all is there, or of which nothing more is to be expected."""
         steps = life.steps
         while steps:
@@ -281,9 +206,11 @@ class _Verifier:
             self._live(life, step, last=ended and not steps)
             life.done = step
             self._done[life.id] = max(self._done[life.id], step)
-        life.over = ended
+        if ended:
+            self._give_up(life)
+            life.over = True
 
-    def _can_go_on(self, life: _Life, step: int) -> bool:
+    def _can_go_on(self, life: Life, step: int) -> bool:
         """Whether the step is over and its inputs are there, or have been waited for long enough."""
         later = len(life.steps) - 1
         if later >= WAIT_STEPS:
@@ -298,7 +225,7 @@ class _Verifier:
             self._waiting.setdefault(life.awaits, []).append(life)
         return life.awaits is None
 
-    def _give_up(self, life: _Life) -> None:
+    def _give_up(self, life: Life) -> None:
         """Wait no longer."""
         if life.awaits is not None:
             waiting = self._waiting[life.awaits]
@@ -307,7 +234,7 @@ class _Verifier:
                 del self._waiting[life.awaits]
             life.awaits = None
 
-    def _lacking(self, life: _Life, step: int) -> _Place | None:
+    def _lacking(self, life: Life, step: int) -> Place | None:
         """The first input of a step that is not there."""
         own = self._shelves[life.id]
         for stage, following in zip(self._stages, self._published[1:], strict=True):
@@ -317,13 +244,13 @@ class _Verifier:
                     return j, stage, step
         return None
 
-    def _finish_former_lives(self, life: _Life) -> None:
+    def _finish_former_lives(self, life: Life) -> None:
         """A life that broke off within a step has that left: live it again while its inputs are still there."""
         for former in self._lives[life.id].values():
             if former.born < life.born and not former.over:
                 self._go_on(former, ended=True)
 
-    def _live(self, life: _Life, step: int, last: bool) -> None:
+    def _live(self, life: Life, step: int, last: bool) -> None:
         """Live one step again. In the `last` of a life the last stages may be missing: it came no further."""
         shelf = self._shelves[life.id]
         said = [shelf.said(stage, step, life.born) for stage in self._published]
@@ -341,12 +268,12 @@ class _Verifier:
             elif last and not any(said[number + 1 :]):
                 return
             else:  # whose messages it used nobody knows; what is missing is counted when the next of its kind comes
-                life.doubt = _Doubt.MISSING
+                life.doubt = Doubt.MISSING
                 heard = (j for j in node.neighbours if j != self._nobody and step in self._shelves[j].by_stage[stage])
                 self._feed(life, node, stage, step, heard)
                 node.tick(number + 1)
 
-    def _make(self, life: _Life) -> Node:
+    def _make(self, life: Life) -> Node:
         method = self._method(Setting(life.id, self._scenario.system(), self._graph, life.born))
         return Node(
             life.id,
@@ -357,14 +284,14 @@ class _Verifier:
             expected=(self._nobody,),
         )
 
-    def _measured(self, life: _Life, measurement: Message | None, following: Message | None) -> Array | None:
+    def _measured(self, life: Life, measurement: Message | None, following: Message | None) -> Array | None:
         """The own measurement; if it is not there, a stand-in where there was one."""
         if measurement is not None:
             return cast("Array | None", measurement.fields["y"])
-        life.doubt = _Doubt.MISSING  # it is counted when the next comes
+        life.doubt = Doubt.MISSING  # it is counted when the next comes
         return self._stand_in(life.id) if following is not None and life.id in _inputs(following) else None
 
-    def _feed(self, life: _Life, node: Node, stage: str, step: int, senders: Iterable[NodeId]) -> None:
+    def _feed(self, life: Life, node: Node, stage: str, step: int, senders: Iterable[NodeId]) -> None:
         """Give the node the messages of its neighbours that it used in a stage."""
         now = self._order[stage]
         for j in senders:
@@ -381,7 +308,7 @@ class _Verifier:
                 node.gone(j, now)
             node.receive(message, now)
 
-    def _missed(self, life: _Life, j: NodeId, stage: str, step: int) -> Message | None:
+    def _missed(self, life: Life, j: NodeId, stage: str, step: int) -> Message | None:
         """Note an input that is missing. For a measurement there is a stand-in: the covariances come out right then."""
         newest = max(self._shelves[j].by_stage[stage], default=0)
         cut_off = not self._complete and newest < step
@@ -394,16 +321,16 @@ class _Verifier:
     def _stand_in(self, node: NodeId) -> Array:
         return np.zeros(self._scenario.system().by_id[node].ny)
 
-    def _judge(self, life: _Life, told: Message, effects: Sequence[Effect]) -> None:
+    def _judge(self, life: Life, told: Message, effects: Sequence[Effect]) -> None:
         """Compare what the node says with what it said."""
         tally, stage = self._part.tallies[life.id], told.stage
         again = next(effect for effect in effects if isinstance(effect, Message) and effect.stage == stage)
         found = life.comparison.differs(stage, told.fields, again.fields)
         if found is None:
             tally.identical += 1
-        elif life.doubt is _Doubt.CUT_OFF:
+        elif life.doubt is Doubt.CUT_OFF:
             tally.cut_off += 1
-        elif life.doubt is _Doubt.MISSING:
+        elif life.doubt is Doubt.MISSING:
             tally.unverifiable += 1
         else:
             name, ulps = found
@@ -411,22 +338,21 @@ class _Verifier:
             life.differences += 1
             life.first = life.first or here
 
-    def _settle(self, life: _Life, proven: bool = True) -> None:
+    def _settle(self, life: Life, proven: bool = True) -> None:
         """Count a life's differences as that, or, where an event is missing that may explain them, as unverifiable."""
         tally = self._part.tallies[life.id]
         if proven:
             tally.different += life.differences
             if life.first is not None:
-                self._part.firsts.append((self._place(life.first), life.first))
-                self._part.firsts = [min(self._part.firsts, key=itemgetter(0))]
+                self._part.note(self._place(life.first), life.first)
         else:
             tally.unverifiable += life.differences
         life.differences, life.first = 0, None
 
-    def _place(self, difference: Difference) -> tuple[int, int, int]:
+    def _place(self, difference: Difference) -> _Order:
         return difference.step, self._order[difference.stage], self._graph.ids.index(difference.node)
 
-    def _count(self, life: _Life, message: Message) -> bool:
+    def _count(self, life: Life, message: Message) -> bool:
         """Notice by the sender's counter what is missing before a message; whether something is."""
         stage, expected = message.stage, life.counters.get(message.stage, 0)
         lost = message.seq - expected
@@ -438,12 +364,12 @@ class _Verifier:
                 self._part.tallies[life.id].unverifiable += lost
         return lost > 0
 
-    def _miss(self, life: _Life, what: str, cut_off: bool = False) -> None:
+    def _miss(self, life: Life, what: str, cut_off: bool = False) -> None:
         """Something that this life depends on is not there: from now on a difference proves nothing."""
         if cut_off:
-            life.doubt = life.doubt or _Doubt.CUT_OFF
+            life.doubt = life.doubt or Doubt.CUT_OFF
             return
-        life.doubt = _Doubt.MISSING
+        life.doubt = Doubt.MISSING
         self._part.missing_count += 1
         if len(self._part.missing) < NAMED:
             self._part.missing.append(what)
@@ -480,10 +406,11 @@ def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 
             parts = list(pool.map(_verify_file, repeat(recording.path), shares, repeat(tolerance)))
     tallies = {node: tally for part in parts for node, tally in part.tallies.items()}
     missing = [what for part in parts for what in part.missing]
+    firsts = sorted(filter(None, (part.first for part in parts)), key=itemgetter(0))
     return Verdict(
         nodes={node: tallies[node] for node in scenario.ids},
         lives=sum(part.lives for part in parts),
-        first=min((first for part in parts for first in part.firsts), key=itemgetter(0), default=(None, None))[1],
+        first=firsts[0][1] if firsts else None,
         missing=tuple(missing[:NAMED]),
         missing_count=sum(part.missing_count for part in parts),
         unreadable=sum(part.unreadable for part in parts),

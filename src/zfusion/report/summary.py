@@ -8,14 +8,22 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from zfusion.drivers.metrics import Latencies, NodeReport, RecorderReport
+from zfusion.methods.prediction import predict
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.stages import ESTIMATE
+
+MOST_PREDICTED = 100_000
+"""Nodes times steps up to which a summary predicts the errors: a few seconds."""
+
+DESIGNED = {"intermediate": "intermediate", ESTIMATE.name: "distributed"}
+"""Stages, and what of a design predicts their errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +50,7 @@ def summarize(
     *,
     failures: Sequence[str] = (),
     interrupted: bool = False,
+    simulated: bool = False,
     logs: str | None = None,
 ) -> dict[str, Any]:
     """The summary as plain data: what ``--json`` prints.
@@ -76,10 +85,12 @@ def summarize(
         "rmse": _by_stage(reports, "mse"),
         "predicted_rmse": _by_stage(reports, "predicted_mse"),
         "nees": _nees(reports),
+        "design_rmse": _design(scenario, reports),
         "recording": recorder.path if recorder else None,
         "lost_on_recording": dict(recorder.lost) if recorder else {},
         "edges": [asdict(edge) for edge in edges],
         "interrupted": interrupted,
+        "simulated": simulated,
         "failures": list(failures),
         "logs": logs,
     }
@@ -154,6 +165,26 @@ def _by_stage(reports: Mapping[NodeId, Sequence[NodeReport]], squared: str) -> d
     return found
 
 
+def _design(scenario: Scenario, reports: Mapping[NodeId, Sequence[NodeReport]]) -> dict[str, dict[str, float]]:
+    """What was predicted before the run, with nothing lost: kind -> node -> root of the mean of trace P over the steps.
+
+    Empty where there is no truth to set it beside, or where it would take longer than a summary may.
+    """
+    steps = max((report.step for lives in reports.values() for report in lives), default=0)
+    if not scenario.truth_known or not 0 < steps * len(scenario.ids) <= MOST_PREDICTED:
+        return {}
+    prediction = predict(scenario.system(), scenario.network, steps)
+    kinds = {kind: getattr(prediction, kind)[1:] for kind in ("local", "intermediate", "distributed")}
+    every = np.repeat(prediction.centralized[1:, None], len(scenario.ids), axis=1)
+    return {
+        kind: {
+            str(node): math.sqrt(float(np.mean(np.einsum("kaa->k", of_kind[:, position]))))
+            for position, node in enumerate(prediction.ids)
+        }
+        for kind, of_kind in (kinds | {"centralized": every}).items()
+    }
+
+
 def _nees(reports: Mapping[NodeId, Sequence[NodeReport]]) -> dict[str, float]:
     """Node -> mean normalised squared error of its estimates; near nx where its covariances can be believed."""
     found = {}
@@ -168,27 +199,36 @@ def _nees(reports: Mapping[NodeId, Sequence[NodeReport]]) -> dict[str, float]:
 def show_summary(console: Console, summary: Mapping[str, Any]) -> None:
     """The summary for people."""
     console.print(f"[bold]{summary['run']}[/]   {summary['method']}")
-    table = Table()
-    stages = list(summary["rmse"])
-    headings = ["node", "steps", *(f"rmse {stage}" for stage in stages)]
-    headings += ["predicted", "nees"] if summary["predicted_rmse"] else []
-    for name in headings:
-        table.add_column(name, justify="left" if name == "node" else "right")
-    predicted = summary["predicted_rmse"].get(ESTIMATE.name, {})
-    for node in map(str, summary["nodes"]):
-        cells = [node, str(summary["completed_steps"][node])]
-        cells += [_number(summary["rmse"][stage].get(node)) for stage in stages]
-        if summary["predicted_rmse"]:
-            cells += [_number(predicted.get(node)), _number(summary["nees"].get(node))]
-        table.add_row(*cells)
-    console.print(table)
+    console.print(_table_of_errors(summary))
+    if summary["design_rmse"]:
+        bounds = {kind: list(summary["design_rmse"][kind].values()) for kind in ("local", "centralized")}
+        told = ", ".join(f"{kind} {_number(sum(of) / len(of))}" for kind, of in bounds.items())
+        console.print(f"predicted rmse without a network and with a centre, mean of the nodes: {told}")
     _show_traffic(console, summary)
     for failure in summary["failures"]:
-        console.print(f"[bold red]failed:[/] {escape(failure)}")
+        console.print(f"[bold red]failed:[/] {escape(failure)}", soft_wrap=True)
     if summary["recording"]:
         console.print(f"recording: {summary['recording']}", soft_wrap=True)
     if summary["logs"] and summary["failures"]:
         console.print(f"logs: {summary['logs']}", soft_wrap=True)
+
+
+def _table_of_errors(summary: Mapping[str, Any]) -> Table:
+    """Root mean square errors by node and stage, each beside what was predicted."""
+    columns: dict[str, Mapping[str, float]] = {}
+    design = summary["design_rmse"] if summary["method"] == "two_stage" else {}
+    for stage, of_nodes in summary["rmse"].items():
+        columns[f"{stage}\nrmse"] = of_nodes
+        columns[f"{stage}\npredicted"] = design.get(DESIGNED[stage]) or summary["predicted_rmse"].get(stage, {})
+    if summary["nees"]:
+        columns[f"{ESTIMATE.name}\nnees"] = summary["nees"]
+    table = Table()
+    for name in ("node", "steps", *columns):
+        table.add_column(name, justify="left" if name == "node" else "right")
+    for node in map(str, summary["nodes"]):
+        cells = [_number(column.get(node)) for column in columns.values()]
+        table.add_row(node, str(summary["completed_steps"][node]), *cells)
+    return table
 
 
 def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
@@ -203,7 +243,7 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
     if summary["refused"]:
         console.print("refused: " + ", ".join(f"{count} {reason}" for reason, count in summary["refused"].items()))
     latency = summary["latency_us"]
-    if summary["rounds_per_s"] and latency["p50"] is not None:
+    if summary["rounds_per_s"] and latency["p50"] is not None and not summary["simulated"]:
         console.print(
             f"{summary['rounds_per_s']:.1f} steps/s; measurement to estimate "
             f"{latency['p50']:.0f} µs (p50), {latency['p99']:.0f} µs (p99)"
@@ -229,4 +269,4 @@ def show_node_report(console: Console, report: Mapping[str, Any]) -> None:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.5g}"
+    return "-" if value is None else f"{value:.4g}"
