@@ -11,6 +11,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+
 from oracles.paper import ERROR_VARIANCES
 
 ROOT = Path(__file__).parents[1]
@@ -115,9 +116,7 @@ def test_replay_names_the_first_difference(simulated: Path, tmp_path: Path) -> N
                 if payload["step"] == 77:
                     payload["x"][0] = float(np.nextafter(payload["x"][0], 9e9))
                     data = msgpack.packb(payload)
-            writer.add_message(
-                numbers[channel.topic], message.log_time, data, message.publish_time, message.sequence
-            )
+            writer.add_message(numbers[channel.topic], message.log_time, data, message.publish_time, message.sequence)
         writer.finish()
     verdict = told("replay", str(changed), "--verify", cwd=tmp_path, code=1)
     assert verdict["different"] == 1
@@ -172,7 +171,7 @@ matrix = [[1]]
         (("R = 1.0", "R = [[1, 2], [3, 4]]"), "sensors[0].R"),
         (("H = 1.0", "H = [[1.0, 0.0]]"), "sensors[0].H"),
         (('name = "tiny"', 'method = "magic"'), "method"),
-        (('name = "tiny"', 'timing = { deadlines = { lunch = 0.5 } }'), "timing.deadlines.lunch"),
+        (('name = "tiny"', "timing = { deadlines = { lunch = 0.5 } }"), "timing.deadlines.lunch"),
         (("F = 1.0", "F = "), "tiny.toml"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Are the errors as large as they are said to be? Many runs, with and without losses, against the predicted covariances.
+"""Are errors as large as they are said to be? Many runs, with and without losses, beside the predicted covariances.
 
 The bounds are derived: a mean over independent runs may differ from what is predicted by 6 of its own standard
 deviations, which are estimated from the runs. In a right implementation that happens once in 5e8 comparisons.
@@ -20,7 +20,7 @@ from zfusion.model.statistics import step_models
 from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 
-STEPS, RUNS, SIGMAS = 25, 1500, 6.0
+STEPS, RUNS, SIGMAS = 25, 2500, 6.0
 LOSS = 0.2
 TARGET_NEIGHBOURS: dict[NodeId, tuple[NodeId, ...]] = {1: (1, 2), 2: (1, 2, 3), 3: (3, 4), 4: (1, 4)}
 CASES = {
@@ -112,7 +112,7 @@ def test_errors_are_as_large_as_predicted(case: str, loss: float) -> None:
 
 
 def test_the_bounds_are_sharp_enough_to_notice_a_few_percent() -> None:
-    """Covariances that are 7 % too small, or that ignore that two thirds of the messages are lost, do not pass."""
+    """Covariances that are 5 % too small do not pass."""
     system, neighbours = CASES["target"]
     truth, readings = runs("target")
     used = always(neighbours, STEPS)
@@ -120,4 +120,4 @@ def test_the_bounds_are_sharp_enough_to_notice_a_few_percent() -> None:
     errors = (truth - x)[:, 1:]
     nees = np.einsum("rka,kab,rkb->rk", errors, np.linalg.inv(P[1:]), errors)
     with pytest.raises(AssertionError):
-        assert_mean(nees.mean(axis=1) / 0.93, system.nx)
+        assert_mean(nees.mean(axis=1) / 0.95, system.nx)

@@ -162,8 +162,8 @@ def test_nothing_is_lost_or_reordered_whatever_ends_the_waits(pair: Pair) -> Non
         while not noise.wait(0.0005):
             pair.inbox.notify("noise")
 
-    threads = [threading.Thread(target=talk, args=(name,)) for name in ("a", "b")]
-    threads.append(threading.Thread(target=disturb))
+    threads = [threading.Thread(target=talk, args=(name,), daemon=True) for name in ("a", "b")]
+    threads.append(threading.Thread(target=disturb, daemon=True))
     for thread in threads:
         thread.start()
     heard: dict[str, list[bytes]] = {"a": [], "b": []}

@@ -24,11 +24,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from zfusion import gaps as gaps_module
 from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
 from zfusion.recording import GapCounter, Gaps, Record, Recording, RecordingWriter, arithmetic_differences
-from zfusion import gaps as gaps_module
 from zfusion.recording import writer as writer_module
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info

@@ -37,7 +37,7 @@ class Status:
     epoch_ns: int | None
     """When step 1 begins, on everybody's clock; None until it is agreed."""
     ready: Mapping[NodeId, int]
-    """Who is known to have found all its neighbours, with the start of its process (ns), which tells its lives apart."""
+    """Who is known to have found all its neighbours, with the start of its process (ns): it tells lives apart."""
     completed: int = 0
     fallbacks: int = 0
     zfusion: str = version("zfusion")

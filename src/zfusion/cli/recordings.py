@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,6 +29,9 @@ from zfusion.model.scenario import Overrides, Scenario
 if TYPE_CHECKING:
     from zfusion.drivers.playback import Extent
     from zfusion.recording import Recording
+
+WORTH_PROCESSES = 100_000
+"""Messages from which on verifying is shared among the machine's cores: starting their processes takes a second."""
 
 DEFAULT_PLAYER = ("tcp/127.0.0.1:7449",)
 """Where a player listens, for consumers to connect to."""
@@ -87,7 +91,8 @@ def _verify(recording: Recording, as_json: bool) -> None:
     from zfusion.report.replay import show_verdict
 
     with err.status("recomputing"):
-        verdict = verify(recording)
+        jobs = (os.cpu_count() or 1) if recording.messages > WORTH_PROCESSES else 1
+        verdict = verify(recording, jobs=jobs)
     finish(verdict.as_dict(), as_json, lambda: show_verdict(out, verdict))
     if not verdict.verified or verdict.unverifiable:
         raise typer.Exit(1)

@@ -154,9 +154,14 @@ class Inbox:
                 self._nudge.wait(threading.TIMEOUT_MAX)
                 continue
             if wait is not rung and (wait is seen or now >= wait.deadline_ns or self.notices):
-                self._session.put(wait.key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+                # In a thread of its own: if the wait has just ended by itself the channel may be full, and hold it up.
+                threading.Thread(target=self._ring, args=(wait.key,), name="bell", daemon=True).start()
                 rung = wait
             seen = wait
             wakes_ns = now + STRETCH_NS
             self._wakes_ns = min(wakes_ns, wait.deadline_ns) if wait is not rung else wakes_ns
             self._nudge.wait((self._wakes_ns - now) / 1e9)
+
+    def _ring(self, key: str) -> None:
+        with suppress(zenoh.ZError):  # the session is closed
+            self._session.put(key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)

@@ -17,7 +17,10 @@ SHOWN_NODES = 32
 
 
 def as_json_object(prediction: Prediction) -> dict[str, Any]:
-    """nodes, steps, error_covariance {local, intermediate, distributed: [step][node][nx][nx]; centralized: [step][nx][nx]}."""
+    """nodes, steps, error_covariance {local, intermediate, distributed, centralized}.
+
+    The first three are [step][node][nx][nx], the last [step][nx][nx]; step 0 is included.
+    """
     return {
         "nodes": list(prediction.ids),
         "steps": len(prediction.centralized) - 1,
@@ -31,7 +34,7 @@ def as_json_object(prediction: Prediction) -> dict[str, Any]:
 
 
 def show_prediction(console: Console, name: str, prediction: Prediction) -> None:
-    """Print mean squared errors, the traces of the covariances, by node at the last step, and by step for their mean."""
+    """Print mean squared errors, trace P: their mean over the nodes by step, and by node at the last step."""
     steps = len(prediction.centralized) - 1
     console.print(f"[bold]{name}[/]   predicted mean squared error, trace P")
     by_step = Table(title="mean over the nodes", title_justify="left")
