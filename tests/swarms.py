@@ -69,6 +69,7 @@ class Result:
     @property
     def summary(self) -> dict[str, Any]:
         """What ``--json`` printed."""
+        assert self.out, self.err
         found: dict[str, Any] = json.loads(self.out)
         return found
 
@@ -86,21 +87,21 @@ class Command:
 
     def __init__(self, directory: Path, *words: object) -> None:
         number = next(_numbers)
-        self._files = [(directory / f"command{number}.{name}").open("w+") for name in ("out", "err")]
-        self.words = [*ZFUSION, *map(str, words)]
+        self._out, self._err = (directory / f"command{number}.{name}" for name in ("out", "err"))
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
-        self.process = subprocess.Popen(
-            self.words,
-            cwd=directory,
-            stdout=self._files[0],
-            stderr=self._files[1],
-            stdin=subprocess.DEVNULL,
-            env={**environment, "COLUMNS": "500"},
-        )
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [*ZFUSION, *map(str, words)],
+                cwd=directory,
+                stdout=out,
+                stderr=err,
+                stdin=subprocess.DEVNULL,
+                env={**environment, "COLUMNS": "500"},
+            )
 
     def said(self) -> str:
         """What it has said on standard error so far."""
-        return Path(self._files[1].name).read_text()
+        return self._err.read_text()
 
     def interrupt(self) -> None:
         """Ctrl-C."""
@@ -114,12 +115,7 @@ class Command:
             if self.process.poll() is None:
                 self.process.kill()
                 self.process.wait()
-        texts = []
-        for file in self._files:
-            file.seek(0)
-            texts.append(file.read())
-            file.close()
-        return Result(code, *texts)
+        return Result(code, self._out.read_text(), self._err.read_text())
 
 
 def run_name(word: str) -> str:

@@ -65,6 +65,7 @@ def main() -> None:
             label=f"{stage}, mean of {RUNS} runs ± 2 s.e.",
         )  # fmt: skip
     axes.set(xlabel="step k", ylabel="mean squared error", title=f"four_sensor: errors of node {NODE}", ylim=(0, None))
+    axes.set_xticks(range(0, STEPS + 1, 5))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="upper left")
     figure.tight_layout()

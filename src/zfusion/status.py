@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from importlib.metadata import version
 from typing import Any
@@ -40,6 +40,8 @@ class Status:
     """Who is known to have found all its neighbours, with the start of its process (ns): it tells lives apart."""
     completed: int = 0
     fallbacks: int = 0
+    estimate: Mapping[str, list[float]] = field(default_factory=dict)
+    """The last one, where there is one: x, and sd, the standard deviations of its errors. For people to look at."""
     zfusion: str = version("zfusion")
     wire: int = VERSION
 

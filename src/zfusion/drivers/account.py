@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import cast
 
-from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report
+from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report, told_estimate
 from zfusion.drivers.sources import Source
 from zfusion.methods import METHODS, Setting
 from zfusion.model.network import Network
@@ -94,6 +94,7 @@ class Account:
             errors={stage: errors.summary() for stage, errors in self._errors.items()},
             latency=latencies.told(),
             overheard=dict(self._source.counters),
+            estimate=told_estimate(node),
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},
         )
 

@@ -28,7 +28,7 @@ from zfusion.drivers.endpoints import Endpoints, linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.key_source import KeySource
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
-from zfusion.drivers.metrics import NodeReport
+from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.sources import Source, open_source
 from zfusion.drivers.transport import on_zenoh_thread, open_session, publisher
 from zfusion.errors import InputError, MessageError
@@ -171,6 +171,7 @@ class LiveNode:
             ready=meeting.ready,
             completed=node.completed if node else 0,
             fallbacks=node.fallbacks if node else 0,
+            estimate=told_estimate(node) if node else {},
         )
 
     def _report(self) -> NodeReport:
@@ -268,8 +269,9 @@ class LiveNode:
         gc.collect()
         gc.freeze()
         gc.set_threshold(GARBAGE_THRESHOLD)
-        now = time.time_ns()
-        self._node, self._account, self._phase = node, Account(node, self._source, now), Phase.RUNNING
+        now, period = time.time_ns(), self._scenario.timing.period_ns
+        first = now if period is None else max(now, start.epoch_ns + start.born * period)
+        self._node, self._account, self._phase = node, Account(node, self._source, first), Phase.RUNNING
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
         return node
 

@@ -155,6 +155,8 @@ class NodeReport:
     """Measurement to estimate, as `Latencies.told`."""
     overheard: dict[str, int] = field(default_factory=dict)
     """What was not a legal message, and other trouble, by reason."""
+    estimate: dict[str, list[float]] = field(default_factory=dict)
+    """The last one: `x`, and `sd`, the standard deviations that its P gives."""
     settled: dict[str, Any] = field(default_factory=dict)
     """completed, elapsed_s and latency of the part of its life that counts as settled, where there is one."""
 
@@ -168,6 +170,14 @@ class NodeReport:
         """Of a life that ended without a report: what is known from the last `Status` that it told."""
         born, step, completed = status["born"], status["step"], status["completed"]
         return cls(node, born, step, completed, 0, 0.0, sent={}, edges={}, fallbacks=0, errors={}, latency={})
+
+
+def told_estimate(node: Node) -> dict[str, list[float]]:
+    """A node's last estimate as plain data: x, and the standard deviations of its errors; empty before the first."""
+    outcome = node.estimate
+    if outcome is None:
+        return {}
+    return {"x": outcome.x.tolist(), "sd": np.sqrt(np.diag(outcome.P)).tolist()}
 
 
 def edge_report(node: Node) -> dict[str, dict[str, dict[str, int]]]:

@@ -17,6 +17,7 @@ from zfusion.drivers.metrics import Latencies, NodeReport, RecorderReport
 from zfusion.methods.prediction import predict
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
+from zfusion.report.table import shown_estimate
 from zfusion.stages import ESTIMATE
 
 MOST_PREDICTED = 100_000
@@ -80,12 +81,14 @@ def summarize(
         "refused": _refused(lives),
         "fallbacks": sum(report.fallbacks for report in lives),
         "skipped": sum(report.skipped for report in lives),
+        "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate(lives),
         "latency_us": {"p50": latencies.quantile_us(0.5), "p99": latencies.quantile_us(0.99)},
         "rmse": _by_stage(reports, "mse"),
         "predicted_rmse": _by_stage(reports, "predicted_mse"),
         "nees": _nees(reports),
         "design_rmse": _design(scenario, reports),
+        "estimates": {str(i): lives[-1].estimate for i, lives in reports.items() if lives},
         "recording": recorder.path if recorder else None,
         "lost_on_recording": dict(recorder.lost) if recorder else {},
         "edges": [asdict(edge) for edge in edges],
@@ -222,11 +225,15 @@ def _table_of_errors(summary: Mapping[str, Any]) -> Table:
         columns[f"{stage}\npredicted"] = design.get(DESIGNED[stage]) or summary["predicted_rmse"].get(stage, {})
     if summary["nees"]:
         columns[f"{ESTIMATE.name}\nnees"] = summary["nees"]
+    last = {} if summary["rmse"] else summary["estimates"]
     table = Table()
     for name in ("node", "steps", *columns):
         table.add_column(name, justify="left" if name == "node" else "right")
+    if last:
+        table.add_column("last estimate ± sd")
     for node in map(str, summary["nodes"]):
         cells = [_number(column.get(node)) for column in columns.values()]
+        cells += [shown_estimate(last.get(node, {}))] if last else []
         table.add_row(node, str(summary["completed_steps"][node]), *cells)
     return table
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -17,6 +17,9 @@ from zfusion.model.types import NodeId
 
 REFRESH_HZ = 4
 
+SHOWN_COMPONENTS = 3
+"""Components of an estimate that fit into a line."""
+
 
 class Watched(Protocol):
     """What the table shows of a process."""
@@ -27,6 +30,13 @@ class Watched(Protocol):
     @property
     def running(self) -> bool:
         """Whether the process is there."""
+
+
+def shown_estimate(estimate: Mapping[str, Sequence[float]]) -> str:
+    """The first components of an estimate, each with the standard deviation of its error."""
+    pairs = list(zip(estimate.get("x", ()), estimate.get("sd", ()), strict=True))
+    shown = ", ".join(f"{x:.3g} ± {sd:.2g}" for x, sd in pairs[:SHOWN_COMPONENTS])
+    return shown + (", ..." if len(pairs) > SHOWN_COMPONENTS else "")
 
 
 class LiveTable:
@@ -64,8 +74,8 @@ class LiveTable:
     def _render(self, nodes: Mapping[NodeId, Watched], recorder: Watched | None, elapsed: float) -> Group:
         steps = self._scenario.steps
         table = Table(title=f"{self._run}   {self._scenario.method.name}   {elapsed:.0f} s")
-        for name in ("node", "state", "step", "completed", "fallbacks", "restarts"):
-            table.add_column(name, justify="left" if name in {"node", "state"} else "right")
+        for name in ("node", "state", "step", "fallbacks", "restarts", "estimate ± sd"):
+            table.add_column(name, justify="left" if name in {"node", "state", "estimate ± sd"} else "right")
         shown = list(nodes.items())[: max(4, self._console.height - 8)]
         for node, child in shown:
             status = child.status
@@ -74,9 +84,9 @@ class LiveTable:
                 str(node),
                 state,
                 f"{status.get('step', 0)}/{steps}",
-                str(status.get("completed", 0)),
                 str(status.get("fallbacks", 0)),
                 str(child.restarts),
+                shown_estimate(status.get("estimate", {})),
             )
         lines: list[Table | Text] = [table]
         if len(shown) < len(nodes):

@@ -1,0 +1,266 @@
+"""What becomes of a swarm when somebody stops it, kills a part of it, or keeps a part from starting."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from swarms import (
+    EXAMPLE,
+    Command,
+    Listener,
+    Recorded,
+    census,
+    client,
+    decoded,
+    endpoints,
+    launch,
+    process_of,
+    recorded,
+    run_name,
+    variant,
+    wait_until,
+    zfusion,
+)
+
+from zfusion.recording import Recording
+
+NODES = ["1", "2", "3", "4"]
+
+
+class Swarm:
+    """A launched swarm, and somebody who listens to it."""
+
+    def __init__(self, directory: Path, *words: object, **tables: Any) -> None:
+        self.run = run_name("swarm")
+        self.recording = directory / f"{self.run}.mcap"
+        self.scenario = variant(directory, **tables)
+        self.command = Command(
+            directory, "launch", self.scenario, "--json", "--run", self.run, "--record", self.recording, *words
+        )
+        self._client = client(*endpoints(self.scenario).values())
+        session = self._client.__enter__()
+        self.estimates = Listener(session, f"zfusion/{self.run}/node/*/estimate")
+
+    def step(self, node: int) -> int:
+        """The last step of which the node's estimate was heard."""
+        key = f"zfusion/{self.run}/node/{node}/estimate"
+        own = [sample for sample in self.estimates.collect() if str(sample.key_expr) == key]
+        return int(decoded(own[-1])["step"]) if own else 0
+
+    def wait_for(self, node: int, step: int) -> None:
+        """Until the node has made the step."""
+        wait_until(lambda: self.step(node) >= step, f"step {step} of node {node}\n{self.command.said()}")
+
+    def kill(self, *words: str, with_signal: signal.Signals = signal.SIGKILL) -> None:
+        os.kill(process_of(self.run, *words), with_signal)
+
+    def messages(self) -> list[Recorded]:
+        return recorded(self.recording)
+
+    def close(self) -> None:
+        self._client.__exit__(None, None, None)
+        for pid in census(self.run):
+            os.kill(pid, signal.SIGKILL)
+        self.command.process.wait()
+
+
+@contextmanager
+def swarm(directory: Path, *words: object, **tables: Any) -> Iterator[Swarm]:
+    running = Swarm(directory, *words, **tables)
+    try:
+        yield running
+        wait_until(lambda: not census(running.run), "nothing is left running", 20)
+    finally:
+        running.close()
+
+
+PACED = {"timing": {"rate_hz": 50.0}}
+ENDLESS = 1_000_000
+
+
+def intermediates(messages: list[Recorded], node: int) -> dict[int, list[int]]:
+    """Step -> whose measurements the node used."""
+    return {
+        m.payload["step"]: m.payload["used"] for m in messages if m.topic.endswith(f"/node/{node}/intermediate")
+    }
+
+
+@pytest.mark.parametrize("timing", [PACED["timing"], {"free_run": True, "rate_hz": None}], ids=["paced", "free"])
+def test_ctrl_c_ends_the_run_cleanly(tmp_path: Path, timing: dict[str, Any]) -> None:
+    words = [] if timing.get("rate_hz") else ["--free-run"]
+    with swarm(tmp_path, "--steps", ENDLESS, *words) as running:
+        running.wait_for(1, 20)
+        running.command.interrupt()
+        result = running.command.wait()
+    assert result.code == 0, result.err
+    summary = result.summary
+    assert summary["interrupted"]
+    assert summary["failures"] == []
+    assert summary["lost"] == 0
+    assert summary["messages"]["sent"] == summary["messages"]["recorded"]
+    assert all(steps >= 20 for steps in summary["completed_steps"].values())
+    with Recording.open(running.recording) as recording:
+        assert recording.complete
+    assert zfusion(tmp_path, "replay", running.recording, "--verify", "--json").code == 0
+
+
+def test_nothing_is_left_when_the_launcher_is_killed(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, **PACED) as running:
+        running.wait_for(2, 10)
+        assert len(census(running.run)) == 6
+        running.command.process.kill()
+        running.command.process.wait()
+        wait_until(lambda: not census(running.run), "nothing is left running", 20)
+    with Recording.open(running.recording) as recording:
+        assert recording.complete  # the recorder had the time
+        assert recording.messages > 100
+
+
+def test_a_node_that_is_stopped_in_its_tracks_does_not_outlive_the_launcher(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, **PACED) as running:
+        running.wait_for(2, 10)
+        running.kill("--id", "3", with_signal=signal.SIGSTOP)
+        running.command.process.kill()
+        running.command.process.wait()
+        wait_until(lambda: not census(running.run), "nothing is left running", 20)
+
+
+def test_a_node_that_dies_is_told_and_the_others_go_on(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", 150, **PACED) as running:
+        running.wait_for(2, 20)
+        running.kill("--id", "2")
+        wait_until(lambda: "node 2 died" in running.command.said(), "the death is told")
+        assert running.step(1) < 150  # at once, not at the end
+        result = running.command.wait()
+    assert result.code == 1
+    summary = result.summary
+    [failure] = summary["failures"]
+    assert failure.startswith("node 2 died at step")
+    assert "SIGKILL" in failure
+    assert {node: summary["completed_steps"][node] for node in "134"} == dict.fromkeys("134", 150)
+    assert 5 <= summary["completed_steps"]["2"] < 150
+    messages = running.messages()
+    last = max(intermediates(messages, 2))
+    used = intermediates(messages, 1)
+    assert used[150] == [1, 3]  # node 1 hears 2 and 3
+    assert used[last - 5] == [1, 2, 3]
+    gone = [m.payload for m in messages if m.topic.endswith("/event") and m.payload["kind"] == "gone"]
+    assert {event["node"] for event in gone if event["data"]["of"] == 2} == {1, 4}
+    assert zfusion(tmp_path, "replay", running.recording, "--verify", "--json").code == 0
+
+
+@pytest.mark.parametrize("pace", ["paced", "free"])
+def test_a_node_that_dies_is_started_again_and_taken_back_in(tmp_path: Path, pace: str) -> None:
+    paced = pace == "paced"
+    steps = 250 if paced else 4000
+    words = ["--steps", steps, "--restart", *([] if paced else ["--free-run"])]
+    with swarm(tmp_path, *words, **(PACED if paced else {})) as running:
+        running.wait_for(2, 20)
+        running.kill("--id", "2")
+        result = running.command.wait()
+    assert result.code == 0, result.err
+    assert "node 2 died" in result.err
+    assert "starting it again" in result.err
+    summary = result.summary
+    assert summary["restarts"] == 1
+    assert summary["failures"] == []
+    assert {node: summary["completed_steps"][node] for node in "134"} == dict.fromkeys("134", steps)
+    messages = running.messages()
+    born = [m.payload["born"] for m in messages if m.topic.endswith("/node/2/intermediate")]
+    assert born[0] == 1
+    assert born[-1] > 20
+    for neighbour, everybody in ((1, [1, 2, 3]), (4, [1, 2, 4])):
+        used = intermediates(messages, neighbour)
+        assert used[19] == everybody
+        assert any(2 not in used[step] for step in range(20, steps))
+        assert used[steps] == everybody
+    verdict = zfusion(tmp_path, "replay", running.recording, "--verify", "--json")
+    assert verdict.code == 0, verdict.out + verdict.err
+
+
+def test_the_death_of_the_recorder_ends_the_run_and_costs_one_flush_at_most(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, recording={"flush_interval_s": 0.2}, **PACED) as running:
+        running.wait_for(3, 75)
+        running.kill("record")
+        result = running.command.wait()
+    assert result.code == 1
+    summary = result.summary
+    assert summary["interrupted"]
+    assert summary["failures"] == ["the recorder died: killed by SIGKILL"]
+    assert min(summary["completed_steps"].values()) >= 70
+    with Recording.open(running.recording) as recording:
+        assert not recording.complete
+        # 0.2 s are 10 steps; the rest is what a busy machine may need between two flushes
+        assert recording.topics[f"zfusion/{running.run}/node/3/estimate"] >= 75 - 10 - 25
+
+
+def refused(directory: Path, *words: object, run: str | None = None) -> str:
+    """The line with which a command refuses to run."""
+    run = run or run_name("refused")
+    result = zfusion(directory, *words, "--run", run)
+    assert result.code == 2, result.err
+    assert not census(run)
+    return result.error
+
+
+def test_a_port_that_is_in_use_fails_the_launch(tmp_path: Path) -> None:
+    scenario = variant(tmp_path)
+    host, port = endpoints(scenario)["3"].removeprefix("tcp/").split(":")
+    with socket.socket() as taken:
+        taken.bind((host, int(port)))
+        taken.listen()
+        error = refused(tmp_path, "launch", scenario, "--no-record")
+    assert error.startswith("error: node 3: ")
+    assert f"{host}:{port}" in error
+    assert "in use" in error
+
+
+def test_a_source_that_is_missing_fails_the_launch(tmp_path: Path) -> None:
+    scenario = variant(tmp_path, source={"kind": "csv", "file": "missing-{id}.csv", "columns": ["y"]})
+    error = refused(tmp_path, "launch", scenario, "--record", "x.mcap")
+    assert error.startswith("error: node ")
+    assert "missing-" in error
+
+
+def test_what_cannot_be_launched_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert "nowhere.toml" in refused(tmp_path, "launch", "nowhere.toml")
+    assert "two_stage" in refused(tmp_path, "launch", EXAMPLE, "--method", "guesswork")
+    assert "1, 2, 3, 4" in refused(tmp_path, "node", EXAMPLE, "--id", "9")
+    for record in ("file/x.mcap", "/proc/nowhere/x.mcap"):
+        assert record in refused(tmp_path, "launch", EXAMPLE, "--record", record)
+    (tmp_path / "x.mcap").mkdir()
+    assert "x.mcap" in refused(tmp_path, "launch", EXAMPLE, "--record", "x.mcap")
+    quiet = variant(tmp_path, recording={"directory": "file"})
+    assert "file" in refused(tmp_path, "launch", quiet, "--no-record")
+
+
+def test_a_source_that_fails_later_is_told_with_its_words(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(
+        "def read(step, t_ns, node):\n    if node == 3 and step > 5:\n        raise OSError('unplugged')\n    return 1.0\n"
+    )
+    scenario = variant(tmp_path, source={"kind": "python", "function": "bad.py:read"})
+    result = launch(tmp_path, scenario, "--free-run", "--steps", 40, "--no-record")
+    assert result.code == 1
+    [failure] = result.summary["failures"]
+    assert failure.startswith("node 3 died at step")
+    assert "unplugged" in failure
+    assert result.summary["completed_steps"]["1"] == 40
+
+
+def test_a_second_launch_does_not_disturb_the_first(tmp_path: Path) -> None:
+    commands = [
+        Command(tmp_path, "launch", EXAMPLE, "--json", "--free-run", "--steps", 30, "--record", f"{n}.mcap")
+        for n in range(2)
+    ]
+    for result in [command.wait() for command in commands]:
+        assert result.code == 0, result.err
+        assert result.summary["completed_steps"] == dict.fromkeys(NODES, 30)
+        assert result.summary["refused"] == {}
