@@ -220,3 +220,23 @@ def test_a_damaged_recording_is_refused(simulated: Path, tmp_path: Path) -> None
     damaged[len(damaged) // 2] ^= 0x55
     (tmp_path / "damaged.mcap").write_bytes(damaged)
     assert "damaged" in zfusion("replay", "damaged.mcap", "--verify", cwd=tmp_path, code=2).stderr
+
+
+def test_a_published_replay_reaches_a_consumer_whole_and_in_order(simulated: Path) -> None:
+    import zenoh
+
+    from zfusion.drivers.endpoints import Endpoints
+    from zfusion.drivers.transport import open_session
+    from zfusion.recording import Recording
+    from zfusion.swarm.launch import free_endpoints
+
+    [endpoint] = free_endpoints(1)
+    with Recording.open(simulated) as recording:
+        wanted = [(r.topic, r.data) for r in recording.records() if r.topic.endswith("/estimate")]
+    with open_session(Endpoints(connect=(endpoint,))) as session:
+        subscriber = session.declare_subscriber("zfusion/run/node/*/estimate", zenoh.handlers.FifoChannel(10_000))
+        arguments = ("--publish", "--speed", "0", "--stage", "estimate", "--listen", endpoint, "--await-consumer")
+        assert told("replay", str(simulated), *arguments, cwd=simulated.parent)["played"] == len(wanted)
+        heard = [subscriber.recv() for _ in wanted]
+        assert [(str(s.key_expr), s.payload.to_bytes()) for s in heard] == wanted
+        subscriber.undeclare()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 WORTH_PROCESSES = 100_000
 """Messages from which on verifying is shared among the machine's cores: starting their processes takes a second."""
 
+POLL_S = 0.02
+"""How often a player that waits for a consumer looks for one."""
+
 DEFAULT_PLAYER = ("tcp/127.0.0.1:7449",)
 """Where a player listens, for consumers to connect to."""
 
@@ -59,6 +63,9 @@ def replay(
     end: Annotated[float | None, typer.Option(help="Seconds from the beginning to end at.", min=0)] = None,
     first_step: FromStep = None,
     last_step: Annotated[int | None, typer.Option(help="Last step to play.", min=0)] = None,
+    await_consumer: Annotated[
+        bool, typer.Option("--await-consumer", help="Begin when somebody subscribes to what is played.")
+    ] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
     topic: Annotated[
         list[str] | None, typer.Option(help="Only topics that match, like '*/estimate'; repeatable.")
@@ -83,7 +90,8 @@ def replay(
             _rerun(opened, output, scenario, Overrides(method=method, seed=seed), loss, run, as_json)
         else:
             extent = Extent(start, end, first_step, last_step)
-            _publish(opened, extent, (node, stage, topic), speed, loop, (listen, connect), as_json)
+            chosen = (node, stage, topic)
+            _publish(opened, extent, chosen, speed, loop, await_consumer, (listen, connect), as_json)
 
 
 def _verify(recording: Recording, as_json: bool) -> None:
@@ -128,20 +136,30 @@ def _publish(
     chosen: tuple[list[str] | None, list[str] | None, list[str] | None],
     speed: float,
     loop: bool,
+    await_consumer: bool,
     endpoints: tuple[list[str] | None, list[str] | None],
     as_json: bool,
 ) -> None:
     from zfusion.drivers.endpoints import Endpoints
     from zfusion.drivers.playback import Player, choose_topics
-    from zfusion.drivers.transport import open_session, republisher
+    from zfusion.drivers.transport import Republisher, open_session
 
     nodes, stages, patterns = (tuple(of or ()) for of in chosen)
     topics = choose_topics(recording, nodes=nodes, stages=stages, patterns=patterns)
     listen, connect = (tuple(of or ()) for of in endpoints)
     with open_session(Endpoints(listen or DEFAULT_PLAYER, connect)) as session:
-        player = Player(recording, republisher(session), speed=speed, extent=extent, topics=topics, loop=loop)
-        on_signals(player.stop)
+        onto = Republisher(session, topics)
+        player = Player(recording, onto.put, speed=speed, extent=extent, topics=topics, loop=loop)
+        stopped = threading.Event()
+
+        def stop() -> None:
+            stopped.set()
+            player.stop()
+
+        on_signals(stop)
         err.print(f"publishing {recording.metadata['run']} on {', '.join(listen or DEFAULT_PLAYER)}")
+        while await_consumer and not onto.heard and not stopped.wait(POLL_S):
+            pass
         played = player.run()
     finish({"played": played}, as_json, lambda: out.print(f"{played} messages published"))
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
@@ -118,13 +118,18 @@ def _reason(error: Exception) -> str:
     return str(error).split(" at /")[0].strip()
 
 
-def republisher(session: zenoh.Session) -> Callable[[str, bytes], None]:
-    """A function that puts a payload on a key, with a publisher for each key that it is called with."""
-    publishers: dict[str, zenoh.Publisher] = {}
+class Republisher:
+    """Puts payloads on given keys, as their first senders did."""
 
-    def put(key: str, data: bytes) -> None:
-        if key not in publishers:
-            publishers[key] = publisher(session, key)
-        publishers[key].put(data)
+    def __init__(self, session: zenoh.Session, keys: Iterable[str]) -> None:
+        self._publishers = {key: publisher(session, key) for key in keys}
 
-    return put
+    @property
+    def heard(self) -> bool:
+        """Whether anybody subscribes to any of the keys."""
+        # the stubs say bool; it is an object, always true, that has the answer
+        return any(cast(Any, each.matching_status).matching for each in self._publishers.values())
+
+    def put(self, key: str, data: bytes) -> None:
+        """Put a payload on one of the keys."""
+        self._publishers[key].put(data)
