@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zfusion.drivers.meeting import LEAD_NS, POLL_NS, Meeting, Start, connected, hops_from_smallest
+from zfusion.drivers.meeting import JOIN_NS, LEAD_NS, POLL_NS, Meeting, Start, connected, hops_from_smallest
 from zfusion.errors import InputError
 from zfusion.status import Phase, Status
 
@@ -202,6 +202,8 @@ def test_a_new_life_does_not_wait_for_neighbours_that_are_away() -> None:
     town.remove(3)
     town.peers[1].step = 7
     town.add(2)
+    assert town.poll(2) is None
+    town.now += JOIN_NS
     assert town.poll(2) == Start(8, town.peers[1].meeting.epoch_ns or 0, frozenset({1}))
 
 

@@ -273,6 +273,7 @@ class LiveNode:
         first = now if period is None else max(now, start.epoch_ns + start.born * period)
         self._node, self._account, self._phase = node, Account(node, self._source, first), Phase.RUNNING
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
+        self._tell_status(now)
         return node
 
     def _take_steps(self, node: Node, start: Start) -> None:

@@ -23,6 +23,11 @@ LEAD_NS = 100_000_000
 """From naming the epoch to the epoch, beside the time that it takes to spread."""
 
 
+JOIN_NS = 3_000_000_000
+"""How long a node that finds others running waits for those that it does not see, from its start: whoever is to dial it
+may not try for some hundred milliseconds. A free-running node that hears nobody would be far ahead of them by then."""
+
+
 @dataclass(frozen=True, slots=True)
 class Start:
     """When and with what a node begins."""
@@ -106,7 +111,8 @@ class Meeting:
         running = [
             s for s in self.heard.values() if s.phase is Phase.RUNNING and s.ready.get(self.own) != self.started_ns
         ]
-        if not running or not self.present <= self.heard.keys():
+        awaited = self.linked if now < self.started_ns + JOIN_NS else self.present
+        if not running or not awaited <= self.heard.keys():
             return None
         epoch = self.epoch_ns if self.epoch_ns is not None else now
         born = max(s.step for s in running) + 1

@@ -23,8 +23,8 @@ import zenoh
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.errors import InputError
 
-RETRY = {"period_init_ms": 20, "period_max_ms": 1000, "period_increase_factor": 1.5}
-"""A neighbour that comes up later is linked within 20 ms, one that is away for long is tried once a second."""
+RETRY = {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}
+"""A neighbour that comes up soon is linked within 20 ms, one that was away for long within a quarter of a second."""
 
 LEASE_MS = 2000
 """A peer that neither closes nor answers (stopped, cut off) counts as gone after this; one that dies, at once."""

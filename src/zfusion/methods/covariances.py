@@ -36,15 +36,14 @@ by on that side comes from A_l, which has them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from zfusion.methods.layout import Blocks, Bools, ByClass, Layout, Used
 from zfusion.model.statistics import StepModel
-from zfusion.model.types import Array, NodeId, sorted_ids
+from zfusion.model.types import Array, NodeId
 
 SETTLED = 1e-14
 """A covariance is settled when no entry moves by more than this in a step, relative to its standard deviations.
@@ -59,111 +58,9 @@ Below it the covariance of the innovations is treated as the singular matrix tha
 SMALLEST_VARIANCE = 1e-290
 """A variance below this is zero: its inverse could not be represented."""
 
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Which nodes and pairs are tracked, and where each node's measurements stand in the stacked vector Y.
-
-    A *slot* is one component of one measurement that a node may use; every node has `size` of them. The matrices of
-    the r pairs (l, j) of a node l stand side by side, in arrays (n, rows, r, columns), so that one product with a
-    matrix of l serves them all.
-    """
-
-    nodes: tuple[NodeId, ...]
-    slots: Ints
-    """Row of Y behind each slot, (n, size); 0 at padding."""
-    sensor: tuple[tuple[NodeId | None, ...], ...]
-    """Sensor behind each slot, (n, size); None at padding."""
-    partners: Ints
-    """Positions in `nodes` of the j that l makes a pair with, (n, r): l itself first, and again as padding."""
-    back: Ints
-    """Where l stands among the partners of each of its partners, (n, r)."""
-    ny: int
-    """Size of Y."""
-    _place: tuple[Mapping[int, int], ...] = field(repr=False)
-    _indices: dict[tuple[int, int], Ints] = field(default_factory=dict, init=False, repr=False)
-
-    @classmethod
-    def build(
-        cls,
-        neighbourhoods: Mapping[NodeId, Collection[NodeId]],
-        sizes: Mapping[NodeId, int],
-        pairs: Iterable[tuple[NodeId, NodeId]] | None = None,
-    ) -> Layout:
-        """Layout for the nodes of `neighbourhoods`, their used sets drawn from those neighbourhoods.
-
-        `sizes` gives the measurement size of every sensor in the stack (sorted ids). Without `pairs` all
-        pairs of the nodes are tracked; the pairs (l, l) always are.
-        """
-        nodes = tuple(sorted_ids(neighbourhoods))
-        first: dict[NodeId, int] = {}
-        ny = 0
-        for s in sorted_ids(sizes):
-            first[s], ny = ny, ny + sizes[s]
-        rows = [[(s, first[s] + c) for s in sorted_ids(neighbourhoods[i]) for c in range(sizes[s])] for i in nodes]
-        size = max((len(row) for row in rows), default=0)
-        partners = _partners(nodes, pairs)
-        place = tuple({q: at for at, q in reversed(list(enumerate(row)))} for row in partners.tolist())
-        back = [[place[q][p] for q in row] for p, row in enumerate(partners.tolist())]
-        return cls(
-            nodes=nodes,
-            slots=np.array([[at for _, at in row] + [0] * (size - len(row)) for row in rows], dtype=np.intp),
-            sensor=tuple((*(s for s, _ in row), *([None] * (size - len(row)))) for row in rows),
-            partners=partners,
-            back=np.array(back, dtype=np.intp),
-            ny=ny,
-            _place=place,
-        )
-
-    def used(self, used: Mapping[NodeId, Collection[NodeId]]) -> Bools:
-        """Which slots each node used, (n, size), from the ids whose measurements it used; absent = none."""
-        empty: tuple[NodeId, ...] = ()
-        rows = [[s in used.get(node, empty) for s in row] for node, row in zip(self.nodes, self.sensor, strict=True)]
-        return np.array(rows, dtype=np.bool_).reshape(self.slots.shape)
-
-    def places(self, positions: Sequence[int]) -> Ints:
-        """Where each of these nodes stands among the partners of each, (c, c); KeyError where two make no pair."""
-        return np.array([[self._place[p][q] for q in positions] for p in positions], dtype=np.intp)
-
-    def flip(self, X: Array) -> Array:
-        """Xᶠ: every pair the other way round, X^(jl)ᵀ in the place of (l, j); from (n, a, r, b) to (n, b, r, a)."""
-        _, rows, r, columns = X.shape
-        index = self._indices.get((rows, columns))
-        if index is None:
-            start = self.partners * (rows * r * columns) + self.back * columns
-            steps = np.arange(columns)[:, None, None] + np.arange(rows) * (r * columns)
-            index = self._indices[rows, columns] = start[:, None, :, None] + steps
-        return X.reshape(-1).take(index)
-
-    def pick(self, matrix: Array) -> Array:
-        """Blocks of a matrix over Y, (ny, ny): the rows of l's slots, the columns of j's, (n, size, r, size)."""
-        index = self._indices.get((0, 0))
-        if index is None:
-            columns = self.slots[self.partners]
-            index = self._indices[0, 0] = self.slots[:, :, None, None] * self.ny + columns[:, None, :, :]
-        return matrix.reshape(-1).take(index)
-
-
-def _partners(nodes: tuple[NodeId, ...], pairs: Iterable[tuple[NodeId, NodeId]] | None) -> Ints:
-    """`Layout.partners`."""
-    position = {node: p for p, node in enumerate(nodes)}
-    others: list[set[int]] = [set() for _ in nodes]
-    if pairs is None:
-        others = [set(range(len(nodes))) for _ in nodes]
-    else:
-        for a, b in pairs:
-            others[position[a]].add(position[b])
-            others[position[b]].add(position[a])
-    rows = [[p, *sorted(row - {p})] for p, row in enumerate(others)]
-    width = max(map(len, rows), default=0)
-    return np.array([row + [p] * (width - len(row)) for p, row in enumerate(rows)], dtype=np.intp)
-
 
 class Gains(NamedTuple):
-    """What the filters need of step k to process data, a leading axis over the nodes.
+    """What the filters need of step k to process data, a leading axis over the n nodes of one class.
 
     x̂_{k/k-1} = F x̂ + WA μ_{k-1};  μ_k = Z_k - H x̂_{k/k-1} - T μ_{k-1};  x̂_{k/k} = x̂_{k/k-1} + K μ_k.
     """
@@ -183,20 +80,19 @@ class Gains(NamedTuple):
 class State(NamedTuple):
     """All covariances at one step; frozen, so that an older one can be kept and gone back to."""
 
-    P: Array
-    """P^(lj)_{k/k}, (n, nx, r, nx)."""
-    E: Array
-    """E[e^l_{k/k} μ^j_kᵀ], (n, nx, r, size)."""
-    Pi: Array
-    """Π^(lj)_k, (n, size, r, size)."""
-    X: Array
-    """E[e^l_{k/k-1} μ^l_kᵀ], (n, nx, size)."""
-    A: Array
-    """Inverse of Π^(ll)_k over the used slots, zero elsewhere, (n, size, size)."""
-    used: Bools
-    """(n, size)."""
-    gains: Gains | None
-    """None before the first step."""
+    P: Blocks
+    """P^(lj)_{k/k}, (nx, nx)."""
+    E: Blocks
+    """E[e^l_{k/k} μ^j_kᵀ], (nx, size)."""
+    Pi: Blocks
+    """Π^(lj)_k, (size, size)."""
+    X: ByClass
+    """E[e^l_{k/k-1} μ^l_kᵀ], (nx, size)."""
+    A: ByClass
+    """Inverse of Π^(ll)_k over the used slots, zero elsewhere, (size, size)."""
+    used: Used
+    gains: tuple[Gains, ...] | None
+    """By class; None before the first step."""
     picked: Picked | None
     """None before the first step."""
     settled: bool
@@ -205,43 +101,51 @@ class State(NamedTuple):
 
 def prior(layout: Layout, covariance: Array) -> State:
     """The state at step 0: nobody knows more than the prior, P^(lj) = Cov[x_0] for all pairs."""
-    (n, size), r, nx = layout.slots.shape, layout.partners.shape[1], len(covariance)
+    nx = len(covariance)
+    pairs = [block.partners.shape for block in layout.blocks]
+    sizes = [c.slots.shape for c in layout.classes]
+    left = [sizes[block.left][1] for block in layout.blocks]
+    right = [sizes[block.right][1] for block in layout.blocks]
     return State(
-        P=np.tile(covariance[:, None, :], (n, 1, r, 1)),
-        E=np.zeros((n, nx, r, size)),
-        Pi=np.zeros((n, size, r, size)),
-        X=np.zeros((n, nx, size)),
-        A=np.zeros((n, size, size)),
-        used=np.zeros((n, size), dtype=np.bool_),
+        P=Blocks(np.tile(covariance[:, None, :], (n, 1, r, 1)) for n, r in pairs),
+        E=Blocks(np.zeros((n, nx, r, b)) for (n, r), b in zip(pairs, right, strict=True)),
+        Pi=Blocks(np.zeros((n, a, r, b)) for (n, r), a, b in zip(pairs, left, right, strict=True)),
+        X=tuple(np.zeros((n, nx, size)) for n, size in sizes),
+        A=tuple(np.zeros((n, size, size)) for n, size in sizes),
+        used=tuple(np.zeros(shape, dtype=np.bool_) for shape in sizes),
         gains=None,
         picked=None,
         settled=False,
     )
 
 
-def forget(layout: Layout, state: State, rows: Collection[int], covariance: Array) -> State:
-    """The state in which the nodes at `rows` know nothing but the prior, of covariance Cov[x_k].
+def forget(layout: Layout, state: State, nodes: Collection[NodeId], covariance: Array) -> State:
+    """The state in which some nodes know nothing but the prior, of covariance Cov[x_k].
 
     An estimate that is the prior mean has e^l = x - m, so P^(lj) = E[(x - m) e^jᵀ] = P^(jj) and
     E[e^l μ^jᵀ] = E[(x - m) μ^jᵀ] = X_j, both because e^j and μ^j are orthogonal to all that is known before.
     """
-    lost = np.zeros(len(layout.nodes), dtype=np.bool_)
-    lost[list(rows)] = True
-    partners = layout.partners
-    one, other = lost[:, None], lost[partners]
-    P, E = (by_pair.transpose(0, 2, 1, 3).copy() for by_pair in (state.P, state.E))
-    own = P[:, 0].copy()
-    P[one & ~other] = own[partners[one & ~other]]
-    P[~one & other] = own[np.nonzero(~one & other)[0]]
-    P[one & other] = covariance
-    E[one & ~other] = state.X[partners[one & ~other]]
-    X, A, used = state.X.copy(), state.A.copy(), state.used.copy()
-    X[lost], A[lost], used[lost] = 0.0, 0.0, False
-    P, E = (np.ascontiguousarray(by_pair.transpose(0, 2, 1, 3)) for by_pair in (P, E))
-    return state._replace(P=P, E=E, X=X, A=A, used=used, settled=False)
+    lost = [np.array([i in nodes for i in c.members]) for c in layout.classes]
+    own = layout.own(state.P)
+    P_arrays, E_arrays = [], []
+    for block, P_array, E_array in zip(layout.blocks, state.P.arrays, state.E.arrays, strict=True):
+        one, other = lost[block.left][:, None], lost[block.right][block.partners]
+        P, E = (by_pair.transpose(0, 2, 1, 3).copy() for by_pair in (P_array, E_array))
+        P[one & ~other] = own[block.right][block.partners[one & ~other]]
+        P[~one & other] = own[block.left][np.nonzero(~one & other)[0]]
+        P[one & other] = covariance
+        E[one & ~other] = state.X[block.right][block.partners[one & ~other]]
+        P_arrays.append(np.ascontiguousarray(P.transpose(0, 2, 1, 3)))
+        E_arrays.append(np.ascontiguousarray(E.transpose(0, 2, 1, 3)))
+    X, A = (
+        tuple(np.where(gone[:, None, None], 0.0, array) for gone, array in zip(lost, by_class, strict=True))
+        for by_class in (state.X, state.A)
+    )
+    used = tuple(mask & ~gone[:, None] for gone, mask in zip(lost, state.used, strict=True))
+    return state._replace(P=Blocks(P_arrays), E=Blocks(E_arrays), X=X, A=A, used=used, settled=False)
 
 
-def advance(layout: Layout, state: State, model: StepModel, used: Bools) -> State:
+def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State:
     """The state at step k from that at k-1, the statistics of step k, and the slots used at k.
 
     Returns `state` itself where it has settled and neither model nor used slots have changed: a
@@ -250,36 +154,41 @@ def advance(layout: Layout, state: State, model: StepModel, used: Bools) -> Stat
     Source: module docstring.
     """
     before = state.picked
-    same = before is not None and before.model is model and (used is state.used or np.array_equal(used, state.used))
+    same = before is not None and before.model is model and _equal(used, state.used)
     if same and state.settled:
         return state
     picked = Picked.of(layout, model, before)
+    flip, H = layout.flip, picked.H
     P, N, TM, w, T = _predict(layout, state, picked)
-    H, flip = picked.H, layout.flip
-    PH = flip(_rows(H, P))
-    half_Pi = _rows(H, 0.5 * PH + N) - TM + picked.half_R
+    G = PH = flip(_rows(layout, H, P))
+    half_Pi = _rows(layout, H, 0.5 * PH)
+    if N is not None and TM is not None:
+        G = PH + N
+        half_Pi = _rows(layout, H, 0.5 * PH + N) - TM
+    half_Pi += picked.half_R
     Pi = half_Pi + flip(half_Pi)
-    A = _inverse(Pi[:, :, 0], used)
-    G = PH + N
-    X = G[:, :, 0].copy()
-    K = X @ A
-    KPi = _rows(K, Pi)
+    A = tuple(map(_inverse, layout.own(Pi), used))
+    X = tuple([own.copy() for own in layout.own(G)])
+    K = _products(X, A)
+    KPi = _rows(layout, K, Pi)
     E = G - KPi
-    E[:, :, 0] = 0.0
-    explained = _rows(K, flip(G - 0.5 * KPi))
-    P = P - (explained + flip(explained))
+    for own in layout.own(E):
+        own[...] = 0.0
+    explained = _rows(layout, K, flip(G - 0.5 * KPi))
+    P -= explained + flip(explained)
     settled = same and _settled(layout, state, P, Pi)
-    return State(P, E, Pi, X, A, used, Gains(model.F, w, H, T, K), picked, settled)
+    gains = tuple([Gains(model.F, *parts) for parts in zip(w, H, T, K, strict=True)])
+    return State(P, E, Pi, X, A, used, gains, picked, settled)
 
 
 class Picked(NamedTuple):
     """The statistics of a step as a layout orders them."""
 
     model: StepModel
-    H: Array
-    """H̄_k at each node's slots, (n, size, nx)."""
-    half_R: Array
-    """½ C_l R C_jᵀ, (n, size, r, size)."""
+    H: ByClass
+    """H̄_k at each node's slots, (size, nx)."""
+    half_R: Blocks
+    """½ C_l R C_jᵀ, (size, size)."""
     half_Q: Array
     """½ Q + F̄ Q1ᵀ, (nx, 1, nx)."""
     noise: PickedNoise | None
@@ -293,30 +202,46 @@ class Picked(NamedTuple):
             if model is old:
                 return before
             if model.H is old.H and model.W is old.W and model.V is old.V and model.B is old.B:
-                half_R = before.half_R if model.R is old.R else 0.5 * layout.pick(model.R)
+                half_R = before.half_R if model.R is old.R else layout.pick(0.5 * model.R)
                 return before._replace(model=model, half_R=half_R, half_Q=_half_noise(model))
         correlated = model.W.any() or model.V.any() or model.B.any()
-        noise = PickedNoise.of(layout, model) if correlated else None
-        return cls(model, model.H[layout.slots], 0.5 * layout.pick(model.R), _half_noise(model), noise)
+        return cls(
+            model=model,
+            H=tuple(model.H[c.slots] for c in layout.classes),
+            half_R=layout.pick(0.5 * model.R),
+            half_Q=_half_noise(model),
+            noise=PickedNoise.of(layout, model) if correlated else None,
+        )
 
 
 class PickedNoise(NamedTuple):
     """What the measurements have to do with the noises to come."""
 
-    W: Array
-    """C_l Wᵀ for each pair, (n, size, r, nx)."""
-    V: Array
-    """C_l Vᵀ C_{j,k}ᵀ, (n, size, r, size)."""
-    B: Array
-    """B C_jᵀ, (n, nx, r, size)."""
+    WA: ByClass
+    """W C_lᵀ, (nx, size): what has to be multiplied by A_l."""
+    VA: ByClass
+    """C_{l,k} V C_lᵀ, (size, size), likewise."""
+    W: Blocks
+    """C_l Wᵀ for each pair, (size, nx)."""
+    V: Blocks
+    """C_l Vᵀ C_{j,k}ᵀ, (size, size)."""
+    B: Blocks
+    """B C_jᵀ, (nx, size)."""
 
     @classmethod
     def of(cls, layout: Layout, model: StepModel) -> PickedNoise:
         """Pick from `model`."""
-        slots, partners = layout.slots, layout.partners
-        W = np.repeat(model.W.T[slots][:, :, None, :], partners.shape[1], axis=2)
-        B = np.ascontiguousarray(model.B.T[slots[partners]].transpose(0, 3, 1, 2))
-        return cls(W, layout.pick(model.V.T), B)
+        slots = [c.slots for c in layout.classes]
+        V = layout.pick(model.V.T)
+        return cls(
+            WA=tuple(model.W.T[at].transpose(0, 2, 1) for at in slots),
+            VA=tuple(own.transpose(0, 2, 1) for own in layout.own(V)),
+            W=Blocks(np.repeat(model.W.T[slots[b.left]][:, :, None, :], b.partners.shape[1], 2) for b in layout.blocks),
+            V=V,
+            B=Blocks(
+                np.ascontiguousarray(model.B.T[slots[b.right][b.partners]].transpose(0, 3, 1, 2)) for b in layout.blocks
+            ),
+        )
 
 
 def _half_noise(model: StepModel) -> Array:
@@ -324,29 +249,46 @@ def _half_noise(model: StepModel) -> Array:
     return half[:, None, :]
 
 
-def _predict(layout: Layout, state: State, picked: Picked) -> tuple[Array, Array | float, Array | float, Array, Array]:
-    """P⁻, N, T_l M_v, w_l and T_l; 0.0 for N and T_l M_v where the noises are white."""
+def _predict(
+    layout: Layout, state: State, picked: Picked
+) -> tuple[Blocks, Blocks | None, Blocks | None, ByClass, ByClass]:
+    """P⁻, N, T_l M_v, w_l and T_l; None for N and T_l M_v where the noises are white."""
     F, noise, flip = picked.model.F, picked.noise, layout.flip
-    half_P = _rows(0.5 * F, state.P) @ F.T + picked.half_Q
+    half_P = Blocks([_side_by_side(0.5 * F, array) @ F.T + picked.half_Q for array in state.P.arrays])
     if noise is None:
-        return half_P + flip(half_P), 0.0, 0.0, np.zeros_like(state.X), np.zeros_like(state.A)
-    w = noise.W[:, :, 0].transpose(0, 2, 1) @ state.A
-    T = noise.V[:, :, 0].transpose(0, 2, 1) @ state.A
-    FK = F @ (state.X @ state.A)
-    told = _rows(np.concatenate((-0.5 * w, -0.5 * T), axis=1), state.Pi)
+        return half_P + flip(half_P), None, None, tuple(map(np.zeros_like, state.X)), tuple(map(np.zeros_like, state.A))
+    w, T = _products(noise.WA, state.A), _products(noise.VA, state.A)
+    FK = tuple([F @ K for K in _products(state.X, state.A)])
+    FE = Blocks([_side_by_side(F, array) for array in state.E.arrays])
+    told = _rows(layout, [-0.5 * np.concatenate(parts, axis=1) for parts in zip(w, T, strict=True)], state.Pi)
     nx = len(F)
-    M_w = flip(_rows(F, state.E) + told[:, :nx]) + noise.W
-    M_v = flip(told[:, nx:]) + noise.V
-    half_P -= _rows(w, M_w) + _rows(FK, noise.W)
-    N = noise.B - _rows(w, M_v) - _rows(FK, noise.V) - flip(_rows(T, M_w))
-    return half_P + flip(half_P), N, _rows(T, M_v), w, T
+    M_w = flip(FE + Blocks([array[:, :nx] for array in told.arrays])) + noise.W
+    M_v = flip(Blocks([array[:, nx:] for array in told.arrays])) + noise.V
+    half_P -= _rows(layout, w, M_w) + _rows(layout, FK, noise.W)
+    N = noise.B - _rows(layout, w, M_v) - _rows(layout, FK, noise.V) - flip(_rows(layout, T, M_w))
+    return half_P + flip(half_P), N, _rows(layout, T, M_v), w, T
 
 
-def _rows(left: Array, X: Array) -> Array:
-    """left_l X^(lj) for all pairs: (n, a, b), or (a, b) for all l, and (n, b, r, c) to (n, a, r, c)."""
+def _rows(layout: Layout, left: Sequence[Array], X: Blocks) -> Blocks:
+    """left_l X^(lj) for all pairs: (n, a, b) by class, and (n, b, r, c) to (n, a, r, c)."""
+    return Blocks(
+        [_side_by_side(left[block.left], array) for block, array in zip(layout.blocks, X.arrays, strict=True)]
+    )
+
+
+def _side_by_side(left: Array, X: Array) -> Array:
+    """One product for each n of (n, a, b), or the same for all (a, b), with (n, b, r, c), to (n, a, r, c)."""
     n, b, r, c = X.shape
     product: Array = left @ X.reshape(n, b, r * c)
-    return product.reshape(n, left.shape[-2], r, c)
+    return product.reshape(n, -1, r, c)
+
+
+def _products(one: ByClass, other: ByClass) -> ByClass:
+    return tuple([a @ b for a, b in zip(one, other, strict=True)])
+
+
+def _equal(one: Used, other: Used) -> bool:
+    return one is other or all(map(np.array_equal, one, other))
 
 
 def _inverse(Pi: Array, used: Bools) -> Array:
@@ -384,13 +326,16 @@ def _unit_inverse(unit: Array) -> Array:
     return pseudo
 
 
-def _settled(layout: Layout, before: State, P: Array, Pi: Array) -> bool:
+def _settled(layout: Layout, before: State, P: Blocks, Pi: Blocks) -> bool:
     """Whether no covariance moved by more than SETTLED of the standard deviations that belong to it."""
     for new, old in ((P, before.P), (Pi, before.Pi)):
-        if new.size and abs(new.item(0) - old.item(0)) > SETTLED * new.item(0):
+        first = new.arrays[0]
+        if first.size and abs(first.item(0) - old.arrays[0].item(0)) > SETTLED * first.item(0):
             return False  # one entry tells most of the time
-        deviation = np.sqrt(np.maximum(new[:, :, 0].diagonal(0, 1, 2), 0.0))
-        bound = deviation[:, :, None, None] * (SETTLED * deviation[layout.partners])[:, None]
-        if (np.abs(new - old) > bound).any():
-            return False
+        deviations = [np.sqrt(np.maximum(own.diagonal(0, 1, 2), 0.0)) for own in layout.own(new)]
+        for block, now, then in zip(layout.blocks, new.arrays, old.arrays, strict=True):
+            right = SETTLED * deviations[block.right][block.partners]
+            bound = deviations[block.left][:, :, None, None] * right[:, None]
+            if (np.abs(now - then) > bound).any():
+                return False
     return True

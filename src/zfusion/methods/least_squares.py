@@ -15,7 +15,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from zfusion.methods.covariances import Gains, Layout, advance, prior
+from zfusion.methods.covariances import Gains, advance, prior
+from zfusion.methods.layout import Layout
 from zfusion.model.statistics import StepModel
 from zfusion.model.types import Array, NodeId
 
@@ -31,7 +32,7 @@ class LeastSquaresFilter:
         self._layout = Layout.build({0: self._neighbourhood}, {j: sizes[j] for j in self._neighbourhood})
         self._state = prior(self._layout, covariance)
         self._everything = self._layout.used({0: self._neighbourhood})
-        self._nx, self._size = len(mean), self._layout.slots.shape[1]
+        self._nx, self._size = len(mean), self._layout.classes[0].slots.shape[1]
         self._step: Array | None = None
         """(x̂, μ)_k = step (x̂_{k-1}, μ_{k-1}, Z_k)."""
         self._known = np.concatenate((mean, np.zeros(self._size)))
@@ -45,7 +46,7 @@ class LeastSquaresFilter:
     @property
     def P(self) -> Array:
         """Covariance of its error, (nx, nx)."""
-        covariance: Array = self._state.P[0, :, 0]
+        covariance: Array = self._state.P.arrays[0][0, :, 0]
         return covariance
 
     @property
@@ -60,7 +61,7 @@ class LeastSquaresFilter:
         state = advance(self._layout, self._state, model, used)
         if self._step is None or state is not self._state:
             assert state.gains is not None  # advance has set them
-            self._state, self._step = state, _one_step(state.gains)
+            self._state, self._step = state, _one_step(state.gains[0])
         values = [measurements[j] for j in self._neighbourhood] if everything else [self._scattered(measurements)]
         self._known = self._step @ np.concatenate((self._known, *values))
 
@@ -68,7 +69,7 @@ class LeastSquaresFilter:
         """Z, (size,), zero where nothing was used."""
         Z = np.zeros(self._size)
         for j, y in measurements.items():
-            first = self._layout.sensor[0].index(j)
+            first = self._layout.classes[0].sensor[0].index(j)
             Z[first : first + len(y)] = y
         return Z
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zfusion.methods.covariances import Bools, Layout, State, advance, forget, prior
+from zfusion.methods.covariances import State, advance, forget, prior
+from zfusion.methods.layout import Ints, Layout, Used
 from zfusion.model.statistics import PriorMoments, StepModel
 from zfusion.model.types import Array, NodeId
 from zfusion.used_sets import Ledger, UsedSet
@@ -33,7 +34,7 @@ UNSETTLED = 16
 """What a step costs whose covariances have to be computed, in steps of settled ones."""
 
 MASKS = 1024
-"""Combinations of used sets whose masks are remembered."""
+"""Combinations of used sets, and of fused neighbours, for which it is remembered where things stand."""
 
 Statistics = Callable[[], Iterator[tuple[StepModel, PriorMoments]]]
 """Starts an iterator over the statistics of steps 1, 2, ..."""
@@ -95,7 +96,8 @@ class Neighbourhood:
         self._aside: dict[int, Tracked] = {}
         """For each row that is not exact at the head: the last state at which it was."""
         self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
-        self._masks: dict[tuple[UsedSet | None, ...], Bools] = {}
+        self._masks: dict[tuple[UsedSet | None, ...], Used] = {}
+        self._where: dict[tuple[NodeId, ...], Ints] = {}
 
     def follow(self, step: int, ledger: Ledger) -> None:
         """Bring the states up to `step` with all that the ledger knows, or nearer to it after a long gap."""
@@ -126,8 +128,13 @@ class Neighbourhood:
 
     def blocks(self, others: Collection[NodeId]) -> tuple[Array, Array, Array]:
         """P^(ii) (nx, nx), P^(ij) (d, nx, nx) and P^(jl) (d, d, nx, nx) for the sorted `others`, at the newest step."""
-        chosen = [self._row[self._node], *(self._row[node] for node in others)]
-        P = self._head.state.P[np.array(chosen)[:, None], :, self._layout.places(chosen)]
+        chosen = (self._node, *others)
+        where = self._where.get(chosen)
+        if where is None:
+            if len(self._where) == MASKS:
+                self._where.clear()
+            where = self._where[chosen] = self._layout.among(chosen, len(self._initial.mean))
+        P = self._head.state.P.flat.take(where)
         return P[0, 0], P[0, 1:], P[1:, 1:]
 
     def moments(self, step: int) -> PriorMoments:
@@ -158,12 +165,14 @@ class Neighbourhood:
         begins = [row for row, h in enumerate(histories) if h is not None and h.born == step] if step > 1 else []
         state, exact = head.state, head.exact
         if begins:
-            state = forget(self._layout, state, begins, self.moments(head.step).covariance)
+            state = forget(
+                self._layout, state, [self._nodes[row] for row in begins], self.moments(head.step).covariance
+            )
         if begins or None in used:
             exact = tuple([(known or row in begins) and used[row] is not None for row, known in enumerate(exact)])
         return Tracked(step, advance(self._layout, state, self._models.at(step)[0], self._mask(used)), exact)
 
-    def _mask(self, used: tuple[UsedSet | None, ...]) -> Bools:
+    def _mask(self, used: tuple[UsedSet | None, ...]) -> Used:
         mask = self._masks.get(used)
         if mask is None:
             if len(self._masks) == MASKS:

@@ -13,8 +13,9 @@ from itertools import combinations
 
 import numpy as np
 
-from zfusion.methods.covariances import Layout, State, advance, prior
+from zfusion.methods.covariances import State, advance, prior
 from zfusion.methods.fusion import fusion_weights
+from zfusion.methods.layout import Ints, Layout
 from zfusion.model.network import Network
 from zfusion.model.statistics import StepModel, prior_moments, step_models
 from zfusion.model.system import System
@@ -46,7 +47,7 @@ def predict(system: System, network: Network, steps: int) -> Prediction:
     local = _Filters(system, {i: (i,) for i in ids})
     intermediate = _Filters(system, network.neighbourhoods, _with_common_listener(network))
     centralized = _Filters(system, {ids[0]: ids})
-    fusion = _Fusion(network, intermediate.layout)
+    fusion = _Fusion(network, intermediate.layout, system.nx)
     shape = (steps + 1, len(ids), system.nx, system.nx)
     prediction = Prediction(ids, np.empty(shape), np.empty(shape), np.empty(shape), np.empty((shape[0], *shape[2:])))
     moments, models = prior_moments(system), step_models(system, ids)
@@ -81,22 +82,20 @@ class _Filters:
     @property
     def covariances(self) -> Array:
         """P^(ll) of all nodes, (n, nx, nx)."""
-        own: Array = self.state.P[:, :, 0]
-        return own
+        return self.layout.in_order(self.layout.own(self.state.P))
 
 
 class _Fusion:
     """Stage 2 at every node, nodes of one degree together."""
 
-    def __init__(self, network: Network, layout: Layout) -> None:
-        position = {node: p for p, node in enumerate(layout.nodes)}
-        by_degree: dict[int, list[list[int]]] = defaultdict(list)
-        for i in layout.nodes:
-            others = [position[j] for j in network.neighbours(i) if j != i]
-            by_degree[len(others)].append([position[i], *others])
+    def __init__(self, network: Network, layout: Layout, nx: int) -> None:
+        by_degree: dict[int, list[tuple[int, Ints]]] = defaultdict(list)
+        for position, i in enumerate(layout.nodes):
+            others = [j for j in network.neighbours(i) if j != i]
+            by_degree[len(others)].append((position, layout.among([i, *others], nx)))
+        self._shape = (len(layout.nodes), nx, nx)
         self._groups = [
-            (np.array(rows, dtype=np.intp), np.array([layout.places(row) for row in rows]))
-            for rows in by_degree.values()
+            ([position for position, _ in rows], np.array([where for _, where in rows])) for rows in by_degree.values()
         ]
         self._latest: tuple[State, Array, Array] | None = None
 
@@ -105,10 +104,11 @@ class _Fusion:
         latest = self._latest
         if latest is not None and latest[0] is state and np.array_equal(latest[1], prior_covariance):
             return latest[2]
-        fused = np.empty_like(state.P[:, :, 0])
-        for rows, places in self._groups:
-            P = state.P[rows[:, :, None], :, places]
-            fused[rows[:, 0]] = fusion_weights(P[:, 0, 0], P[:, 0, 1:], P[:, 1:, 1:], prior_covariance)[1]
+        fused = np.empty(self._shape)
+        flat = state.P.flat
+        for positions, where in self._groups:
+            P = flat.take(where)
+            fused[positions] = fusion_weights(P[:, 0, 0], P[:, 0, 1:], P[:, 1:, 1:], prior_covariance)[1]
         self._latest = state, prior_covariance, fused
         return fused
 

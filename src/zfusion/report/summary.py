@@ -26,6 +26,9 @@ MOST_PREDICTED = 100_000
 DESIGNED = {"intermediate": "intermediate", ESTIMATE.name: "distributed"}
 """Stages, and what of a design predicts their errors."""
 
+HEADINGS = {"intermediate": "intermed."}
+"""Stages by shorter names, so that the table fits into 80 columns."""
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:
@@ -221,8 +224,9 @@ def _table_of_errors(summary: Mapping[str, Any]) -> Table:
     columns: dict[str, Mapping[str, float]] = {}
     design = summary["design_rmse"] if summary["method"] == "two_stage" else {}
     for stage, of_nodes in summary["rmse"].items():
-        columns[f"{stage}\nrmse"] = of_nodes
-        columns[f"{stage}\npredicted"] = design.get(DESIGNED[stage]) or summary["predicted_rmse"].get(stage, {})
+        heading = HEADINGS.get(stage, stage)
+        columns[f"{heading}\nrmse"] = of_nodes
+        columns[f"{heading}\npredicted"] = design.get(DESIGNED[stage]) or summary["predicted_rmse"].get(stage, {})
     if summary["nees"]:
         columns[f"{ESTIMATE.name}\nnees"] = summary["nees"]
     last = {} if summary["rmse"] else summary["estimates"]
