@@ -13,8 +13,9 @@ import pytest
 
 from oracles import paper, random_systems, tracking
 from oracles.brute_force import Used, always
-from zfusion.methods.covariances import Gains, Layout, advance, prior
+from zfusion.methods.covariances import Gains, advance, prior
 from zfusion.methods.fusion import fusion_weights
+from zfusion.methods.layout import Layout
 from zfusion.model.sampling import SamplePath
 from zfusion.model.statistics import step_models
 from zfusion.model.system import System
@@ -54,7 +55,8 @@ def estimate(
     """Stage -> (estimates, (nodes, RUNS, STEPS + 1, nx), and predicted covariances, (nodes, STEPS + 1, nx, nx))."""
     layout = Layout.build(neighbours, {sensor.id: sensor.ny for sensor in system.sensors})
     state, models = prior(layout, system.initial_covariance), step_models(system, system.ids)
-    nodes, nx, (n, size) = layout.nodes, system.nx, layout.slots.shape
+    nodes, nx, (only,) = layout.nodes, system.nx, layout.classes
+    n, size = only.slots.shape
     everything = np.concatenate([readings[i] for i in system.ids], axis=-1)
     x, mu = np.tile(system.initial_mean, (n, RUNS, 1)), np.zeros((n, RUNS, size))
     found = {
@@ -63,15 +65,16 @@ def estimate(
     }
     for k in range(1, STEPS + 1):
         model, moments = next(models)
-        slots = layout.used({i: used[i, k] for i in nodes})
-        state = advance(layout, state, model, slots)
+        mask = layout.used({i: used[i, k] for i in nodes})
+        state = advance(layout, state, model, mask)
         assert state.gains is not None
-        Z = everything[:, k][:, layout.slots].transpose(1, 0, 2) * slots[:, None, :]
-        x, mu = filtered(x, mu, Z, state.gains)
-        found["intermediate"][0][:, :, k], found["intermediate"][1][:, k] = x, state.P[:, :, 0]
+        Z = everything[:, k][:, only.slots].transpose(1, 0, 2) * mask[0][:, None, :]
+        x, mu = filtered(x, mu, Z, state.gains[0])
+        found["intermediate"][0][:, :, k], found["intermediate"][1][:, k] = x, layout.own(state.P)[0]
         for row, i in enumerate(nodes):
-            rows = [row, *(nodes.index(j) for j in heard[i, k] if j != i)]
-            P = state.P[np.array(rows)[:, None], :, layout.places(rows)]
+            members = [i, *(j for j in heard[i, k] if j != i)]
+            rows = [nodes.index(j) for j in members]
+            P = state.P.flat.take(layout.among(members, nx))
             weights, covariance = fusion_weights(P[0, 0], P[0, 1:], P[1:, 1:], moments.covariance)
             z = np.concatenate(
                 [np.broadcast_to(moments.mean, x[row].shape) - x[row], *(x[r] - x[row] for r in rows[1:])], 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,9 @@ import pytest
 
 from oracles import brute_force, paper, random_systems, tracking
 from oracles.brute_force import Estimates, StackedSystem, Used
-from zfusion.methods import covariances
-from zfusion.methods.covariances import Layout, State, advance, forget, prior
+from zfusion.methods import covariances, layout
+from zfusion.methods.covariances import State, advance, forget, prior
+from zfusion.methods.layout import Blocks, Layout
 from zfusion.model.matrices import Fixed, Schedule
 from zfusion.model.noise import MovingAverageNoise, Tap, WhiteNoise
 from zfusion.model.statistics import StepModel, prior_moments, step_models
@@ -52,9 +53,17 @@ class Recursion:
 
     def covariance(self, i: NodeId, j: NodeId) -> Array:
         """P^(ij)."""
-        a, b = self.layout.nodes.index(i), self.layout.nodes.index(j)
-        found: Array = self.state.P[a, :, self.layout.places([a, b])[0, 1]]
+        found: Array = self.state.P.flat.take(self.layout.among([i, j], len(self.moments.mean)))[0, 1]
         return found
+
+    @property
+    def own(self) -> Array:
+        """P^(ii) of all nodes, (n, nx, nx)."""
+        return self.layout.in_order(self.layout.own(self.state.P))
+
+
+def identical(one: Blocks, other: Blocks) -> bool:
+    return all(map(np.array_equal, one.arrays, other.arrays))
 
 
 def at_step(used: Used, k: int) -> dict[NodeId, tuple[NodeId, ...]]:
@@ -110,7 +119,7 @@ def test_the_published_example() -> None:
         if k in paper.ERROR_VARIANCES:
             wanted = paper.ERROR_VARIANCES[k]
             for estimate, found in {"intermediate": recursion, "local": alone, "centralized": everything}.items():
-                np.testing.assert_allclose(found.state.P[:, 0, 0, 0], wanted[estimate], rtol=0, atol=1e-9)
+                np.testing.assert_allclose(found.own[:, 0, 0], wanted[estimate], rtol=0, atol=1e-9)
 
 
 def test_every_pair_is_symmetric_to_the_last_bit() -> None:
@@ -121,8 +130,8 @@ def test_every_pair_is_symmetric_to_the_last_bit() -> None:
         recursion = Recursion(system, neighbours)
         for _ in range(5):
             state = recursion.step(neighbours)
-            assert np.array_equal(recursion.layout.flip(state.P), state.P)
-            assert np.array_equal(recursion.layout.flip(state.Pi), state.Pi)
+            assert identical(recursion.layout.flip(state.P), state.P)
+            assert identical(recursion.layout.flip(state.Pi), state.Pi)
 
 
 def test_a_layout_of_chosen_pairs_gives_the_same_as_one_of_all() -> None:
@@ -132,7 +141,7 @@ def test_a_layout_of_chosen_pairs_gives_the_same_as_one_of_all() -> None:
     pairs: list[tuple[NodeId, NodeId]] = [(0, 3), (5, 3), (3, 5), (6, 1), (2, 2)]
     every, chosen = Recursion(system, neighbours), Recursion(system, neighbours, pairs)
     used = random_systems.random_used_sets(rng, neighbours, STEPS)
-    assert chosen.layout.partners.shape[1] == 3  # node 3 and two others: the rest is padding
+    assert chosen.layout.blocks[0].partners.shape[1] == 3  # node 3 and two others: the rest is padding
     for k in range(1, STEPS + 1):
         every.step(at_step(used, k))
         chosen.step(at_step(used, k))
@@ -141,6 +150,37 @@ def test_a_layout_of_chosen_pairs_gives_the_same_as_one_of_all() -> None:
             np.testing.assert_array_equal(chosen.covariance(j, i), chosen.covariance(i, j).T)
     with pytest.raises(KeyError):
         chosen.covariance(0, 1)
+
+
+def test_nodes_of_very_different_sizes_are_padded_in_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hub, its leaves, and a chain: the same numbers as with one size for all."""
+    rng = np.random.default_rng(13)
+    system = random_systems.random_system(rng, ids=range(9), nx=2)
+    neighbours: Neighbours = {0: tuple(range(7)), **{i: (0, i) for i in range(1, 7)}, 7: (6, 7, 8), 8: (8,)}
+    used = random_systems.random_used_sets(rng, neighbours, STEPS)
+    pairs = [(i, j) for members in neighbours.values() for i in members for j in members]
+    one = Recursion(system, neighbours, pairs)
+    monkeypatch.setattr(layout, "WASTE", 0)
+    several = Recursion(system, neighbours, pairs)
+    assert len(one.layout.classes) == 1
+    assert len(several.layout.classes) > 2
+    for k in range(1, STEPS + 1):
+        for recursion in (one, several):
+            if k == 6:
+                covariance = recursion.moments.covariance
+                recursion.state = forget(recursion.layout, recursion.state, [0, 3, 8], covariance)
+            recursion.step(at_step(used, k))
+        for i, j in pairs:
+            np.testing.assert_allclose(several.covariance(i, j), one.covariance(i, j), rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(several.own, one.own, rtol=1e-11)
+        assert identical(several.layout.flip(several.state.P), several.state.P)
+
+
+def test_a_hub_with_hundreds_of_leaves_is_not_padded_to_the_fourth_power() -> None:
+    ids: list[NodeId] = list(range(301))
+    neighbours: Neighbours = {0: tuple(ids), **{i: (0, i) for i in ids[1:]}}
+    tracked = Layout.build(neighbours, dict.fromkeys(ids, 1))
+    assert prior(tracked, np.eye(2)).Pi.nbytes < 10_000_000
 
 
 def test_a_node_that_forgets_is_one_that_has_used_nothing_so_far() -> None:
@@ -153,13 +193,11 @@ def test_a_node_that_forgets_is_one_that_has_used_nothing_so_far() -> None:
         forgetful, newborn = Recursion(system, neighbours), Recursion(system, neighbours)
         for k in range(1, STEPS + 1):
             if k == 6:
-                rows = [row for row, i in enumerate(forgetful.layout.nodes) if i in lost]
-                covariance = forgetful.moments.covariance
-                forgetful.state = forget(forgetful.layout, forgetful.state, rows, covariance)
+                forgetful.state = forget(forgetful.layout, forgetful.state, lost, forgetful.moments.covariance)
             forgetful.step(at_step(used, k))
             newborn.step({i: () if k < 6 and i in lost else used[i, k] for i in neighbours})
-        scale = np.abs(newborn.state.P).max()
-        np.testing.assert_allclose(forgetful.state.P, newborn.state.P, rtol=0, atol=1e-12 * scale)
+        wanted = newborn.state.P.flat
+        np.testing.assert_allclose(forgetful.state.P.flat, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
 
 
 def test_what_is_known_of_a_past_state_is_not_changed_by_going_on() -> None:
@@ -167,12 +205,16 @@ def test_what_is_known_of_a_past_state_is_not_changed_by_going_on() -> None:
     system = random_systems.random_system(rng, ids=NAMES)
     recursion = Recursion(system, dict.fromkeys(NAMES, NAMES))
     states = [recursion.step(dict.fromkeys(NAMES, NAMES[:k])) for k in (4, 2, 0, 3)]
-    copies = [[np.copy(array) for array in (s.P, s.E, s.Pi, s.X, s.A)] for s in states]
-    forget(recursion.layout, recursion.state, [1], recursion.moments.covariance)
+    copies = [arrays_of(state, np.copy) for state in states]
+    forget(recursion.layout, recursion.state, ["hall"], recursion.moments.covariance)
     recursion.step({})
     for state, copy in zip(states, copies, strict=True):
-        for array, before in zip((state.P, state.E, state.Pi, state.X, state.A), copy, strict=True):
-            assert np.array_equal(array, before)
+        assert all(map(np.array_equal, arrays_of(state), copy))
+
+
+def arrays_of(state: State, act: Callable[[Array], Array] = np.asarray) -> list[Array]:
+    by_pair = (array for blocks in (state.P, state.E, state.Pi) for array in blocks.arrays)
+    return [act(array) for array in (*by_pair, *state.X, *state.A)]
 
 
 # --- innovations that can be predicted
@@ -248,7 +290,7 @@ def test_a_singular_innovation_covariance_is_a_legal_one(name: str) -> None:
             for j in neighbours:
                 wanted = estimates[i].errors[k] @ estimates[j].errors[k].T
                 np.testing.assert_allclose(recursion.covariance(i, j), wanted, rtol=0, atol=1e-11 * scale)
-        assert np.isfinite(state.A).all()
+        assert all(np.isfinite(A).all() for A in state.A)
 
 
 def test_what_cannot_be_predicted_is_not_taken_for_it() -> None:
@@ -257,7 +299,7 @@ def test_what_cannot_be_predicted_is_not_taken_for_it() -> None:
     recursion = Recursion(system, {1: (1, 2)})
     for _ in range(3):
         recursion.step({1: (1, 2)})
-    assert recursion.state.P[0, 0, 0, 0] < 1e-9
+    assert recursion.own[0, 0, 0] < 1e-9
 
 
 # --- in the long run
@@ -293,7 +335,7 @@ def test_a_time_invariant_network_settles_and_then_costs_nothing(
     recursion.step({**neighbours, system.ids[0]: ()})
     assert len(work) == 1
     assert steps_until_settled(recursion, neighbours, 1000) > 2
-    np.testing.assert_allclose(recursion.state.P, settled.P, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(recursion.state.P.flat, settled.P.flat, rtol=1e-11, atol=1e-13)
 
 
 def test_settling_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,10 +347,10 @@ def test_settling_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     working = Recursion(system, neighbours)
     for state in states:
         assert working.step(neighbours) is not state
-        np.testing.assert_allclose(state.P, working.state.P, rtol=1e-12)
+        np.testing.assert_allclose(state.P.flat, working.state.P.flat, rtol=1e-12)
     assert working.state.gains is not None
     assert states[-1].gains is not None
-    np.testing.assert_allclose(states[-1].gains.K, working.state.gains.K, rtol=1e-12)
+    np.testing.assert_allclose(states[-1].gains[0].K, working.state.gains[0].K, rtol=1e-12)
 
 
 def test_a_target_is_tracked_without_drift() -> None:
@@ -326,8 +368,9 @@ def test_a_target_is_tracked_without_drift() -> None:
         state = advance(recursion.layout, state, recursion.model, used)._replace(settled=False)
         if k == 1_000:
             early = state
-    deviation = np.sqrt(early.P[:, :, 0].diagonal(0, 1, 2))
-    scale = deviation[:, :, None, None] * deviation[recursion.layout.partners][:, None]
-    assert np.abs((state.P - early.P) / scale).max() < 1e-10
-    assert np.linalg.eigvalsh(state.P[:, :, 0]).min() > 1e-4
-    assert np.array_equal(recursion.layout.flip(state.P), state.P)
+    (now,), (then,) = state.P.arrays, early.P.arrays
+    deviation = np.sqrt(then[:, :, 0].diagonal(0, 1, 2))
+    scale = deviation[:, :, None, None] * deviation[recursion.layout.blocks[0].partners][:, None]
+    assert np.abs((now - then) / scale).max() < 1e-10
+    assert np.linalg.eigvalsh(now[:, :, 0]).min() > 1e-4
+    assert identical(recursion.layout.flip(state.P), state.P)

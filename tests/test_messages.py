@@ -303,7 +303,7 @@ def test_size_is_looked_at_before_anything_else() -> None:
 
 
 def test_every_reason_of_a_decoder_is_one_that_can_happen() -> None:
-    elsewhere = {Reason.UNKNOWN_KEY, Reason.NOT_A_MAP, Reason.MISSING_FIELD}
+    elsewhere = {Reason.NOT_JSON, Reason.UNKNOWN_KEY, Reason.NOT_A_MAP, Reason.MISSING_FIELD}
     assert {expected for _, _, expected in ILLEGAL} | elsewhere == set(Reason)
 
 

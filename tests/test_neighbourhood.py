@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from oracles import random_systems
 from zfusion.methods import neighbourhood
-from zfusion.methods.covariances import Layout, State, advance, prior
+from zfusion.methods.covariances import State, advance, prior
+from zfusion.methods.layout import Layout
 from zfusion.methods.neighbourhood import Neighbourhood, StepModels
 from zfusion.model.statistics import prior_moments, step_models
 from zfusion.model.system import System
@@ -58,8 +59,7 @@ def assert_exact(tracked: Neighbourhood, known: frozenset[NodeId], truth: tuple[
     layout, state = truth
     others = sorted(known - {OWN})
     own, cross, among = tracked.blocks(others)
-    rows = [layout.nodes.index(i) for i in (OWN, *others)]
-    wanted = state.P[np.array(rows)[:, None], :, layout.places(rows)]
+    wanted = state.P.flat.take(layout.among((OWN, *others), 2))
     found = np.empty_like(wanted)
     found[0, 0], found[0, 1:], found[1:, 1:] = own, cross, among
     found[1:, 0] = cross.swapaxes(-1, -2)

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import zenoh
@@ -69,6 +70,8 @@ class Inbox:
         self._channels: dict[Hashable, Any] = {}
         self._keys: dict[Hashable, str] = {}
         self._bell = os.urandom(16)
+        self._bells: list[threading.Thread] = []
+        """That may still be ringing."""
         self._wait: _Wait | None = None
         self._alarm = Wake()
         self._nudge = Wake()
@@ -144,6 +147,8 @@ class Inbox:
         self._watcher.join()
         for channel in self._channels.values():
             channel.undeclare()  # a session with a full channel would not close
+        for bell in self._bells:
+            bell.join()  # a session that is being used would not, either
 
     def _watch(self) -> None:
         seen = rung = None
@@ -154,8 +159,7 @@ class Inbox:
                 self._nudge.wait(threading.TIMEOUT_MAX)
                 continue
             if wait is not rung and (wait is seen or now >= wait.deadline_ns or self.notices):
-                # In a thread of its own: if the wait has just ended by itself the channel may be full, and hold it up.
-                threading.Thread(target=self._ring, args=(wait.key,), name="bell", daemon=True).start()
+                self._ring(wait.key)
                 rung = wait
             seen = wait
             wakes_ns = now + STRETCH_NS
@@ -163,5 +167,8 @@ class Inbox:
             self._nudge.wait((self._wakes_ns - now) / 1e9)
 
     def _ring(self, key: str) -> None:
-        with suppress(zenoh.ZError):  # the session is closed
-            self._session.put(key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+        """In a thread of its own: if the wait has just ended by itself the channel may be full, and hold it up."""
+        put = partial(self._session.put, key, self._bell, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+        bell = threading.Thread(target=put, name="bell", daemon=True)
+        self._bells = [bell, *(ringing for ringing in self._bells if ringing.is_alive())]
+        bell.start()

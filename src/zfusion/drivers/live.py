@@ -14,6 +14,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
@@ -59,6 +60,8 @@ AHEAD = 65_536
 was restarted follows it."""
 
 QUESTIONS = frozenset({"status?", "history?"})
+"""Notices of queries. Each must be dropped explicitly, answered or not: Python would drop it holding its global lock, and
+Zenoh's thread may be waiting for that while it holds what dropping needs."""
 
 MAX_NOTICES = 4096
 """Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""
@@ -111,8 +114,10 @@ class LiveNode:
         self._stopping = False
         self._unconfirmed: set[NodeId] = set()
         """Who has not said yet that it has this node's last messages."""
-        self._leaving: set[object] = set()
+        self._leaving: set[NodeId] = set()
         """Who has said that it had put its last messages."""
+        self._answered: set[NodeId] = set()
+        """Who was told how this node is doing."""
         self._overheard: Counter[str] = Counter()
         self._strangers: set[NodeId] = set()
         self._decoders: dict[Channel, Decoder] = {}
@@ -151,6 +156,9 @@ class LiveNode:
             finally:
                 self._inbox.close()
                 self._source.close()
+                for kind, about in filter(None, self._inbox.notices):
+                    if kind in QUESTIONS:
+                        about.drop()
         return self._report()
 
     def stop(self) -> None:
@@ -236,7 +244,9 @@ class LiveNode:
         return on_zenoh_thread(partial(self._note, kind))
 
     def _note(self, kind: str, about: Any) -> None:
-        if kind not in QUESTIONS or len(self._inbox.notices) < MAX_NOTICES:
+        if kind in QUESTIONS and len(self._inbox.notices) >= MAX_NOTICES:
+            about.drop()
+        else:
             self._inbox.notify((kind, about))
 
     def _join(self) -> Start | None:
@@ -244,7 +254,11 @@ class LiveNode:
         next_poll = time.time_ns()
         next_word = next_poll + WORD_NS
         while not self._stopping:
-            self._handle_notices()
+            try:
+                self._handle_notices()
+            except InputError:
+                self._be_refused()
+                raise
             now = time.time_ns()
             start = self._meeting.start(now)
             if start is not None:
@@ -259,6 +273,14 @@ class LiveNode:
                 log.warning("waiting for %s", ", ".join(self._meeting.missing()))
             self._inbox.rest(next_poll)
         return None
+
+    def _be_refused(self) -> None:
+        """Stay until those who are there have been told, too, what this node runs: they are to say so themselves."""
+        end = time.time_ns() + int(ANSWER_S * 1e9)
+        while not self._stopping and not self._meeting.present <= self._answered and time.time_ns() < end:
+            self._inbox.rest(end)
+            with suppress(InputError):
+                self._handle_notices()
 
     def _begin(self, start: Start) -> Node:
         """Make the node, and say that it is there."""
@@ -385,11 +407,11 @@ class LiveNode:
             self._publish[TRUTH.name](encode(message))
 
     def _query(self, key: str, kind: str, about: NodeId) -> None:
-        """Ask, and say if this node is leaving; the answer comes as a notice."""
+        """Ask, and say who asks and whether it is leaving; the answer comes as a notice."""
         self._session.get(
             key,
             on_zenoh_thread(lambda reply: self._note(kind, (about, reply))),
-            payload=encode_any({"leaving": self.id} if self._phase is Phase.DONE else {}),
+            payload=encode_any({"from": self.id, "leaving": self._phase is Phase.DONE}),
             timeout=ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
@@ -477,17 +499,22 @@ class LiveNode:
         self._node.learn_history(of, answer.born, answer.end, answer.runs)
 
     def _answer_status(self, query: Any) -> None:
-        asker = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
-        if isinstance(leaving := asker.get("leaving"), int | str):
-            self._leaving.add(leaving)
-        query.reply(keys.status_key(self._options.run, self.id), self.status().encode())
+        with query:
+            question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
+            query.reply(keys.status_key(self._options.run, self.id), self.status().encode())
+            asker = question.get("from")
+            if isinstance(asker, int | str):
+                self._answered.add(asker)
+                if question.get("leaving"):
+                    self._leaving.add(asker)
 
     def _answer_history(self, query: Any) -> None:
-        node = self._node
-        own = node.ledger.of(self.id) if node is not None else None
-        if node is not None and own is not None:
-            answer = HistoryAnswer(node.born, own.last, own.runs(own.last))
-            query.reply(keys.history_key(self._options.run, self.id), answer.encode())
+        with query:
+            node = self._node
+            own = node.ledger.of(self.id) if node is not None else None
+            if node is not None and own is not None:
+                answer = HistoryAnswer(node.born, own.last, own.runs(own.last))
+                query.reply(keys.history_key(self._options.run, self.id), answer.encode())
 
     _handlers: ClassVar[dict[str, Callable[[LiveNode, Any], None]]] = {
         "token": _on_token,

@@ -201,7 +201,8 @@ class Recorder:
                 self._on_token(about)
             else:
                 self._drain()  # the asker's messages are in the channel, before its question
-                about.reply(keys.recorder_status_key(self._run), encode_any({"messages": self._count().messages}))
+                with about:  # queries are to be dropped explicitly, see `live.QUESTIONS`
+                    about.reply(keys.recorder_status_key(self._run), encode_any({"messages": self._count().messages}))
         everybody_left = self._until_all_gone and self._seen == self._ids and not self._present
         if self._stopping or everybody_left:
             self._drain()

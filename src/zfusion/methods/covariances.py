@@ -90,6 +90,8 @@ class State(NamedTuple):
     """E[e^l_{k/k-1} μ^l_kᵀ], (nx, size)."""
     A: ByClass
     """Inverse of Π^(ll)_k over the used slots, zero elsewhere, (size, size)."""
+    K: ByClass
+    """The gain X_l A_l, (nx, size)."""
     used: Used
     gains: tuple[Gains, ...] | None
     """By class; None before the first step."""
@@ -112,6 +114,7 @@ def prior(layout: Layout, covariance: Array) -> State:
         Pi=Blocks(np.zeros((n, a, r, b)) for (n, r), a, b in zip(pairs, left, right, strict=True)),
         X=tuple(np.zeros((n, nx, size)) for n, size in sizes),
         A=tuple(np.zeros((n, size, size)) for n, size in sizes),
+        K=tuple(np.zeros((n, nx, size)) for n, size in sizes),
         used=tuple(np.zeros(shape, dtype=np.bool_) for shape in sizes),
         gains=None,
         picked=None,
@@ -137,12 +140,12 @@ def forget(layout: Layout, state: State, nodes: Collection[NodeId], covariance: 
         E[one & ~other] = state.X[block.right][block.partners[one & ~other]]
         P_arrays.append(np.ascontiguousarray(P.transpose(0, 2, 1, 3)))
         E_arrays.append(np.ascontiguousarray(E.transpose(0, 2, 1, 3)))
-    X, A = (
+    X, A, K = (
         tuple(np.where(gone[:, None, None], 0.0, array) for gone, array in zip(lost, by_class, strict=True))
-        for by_class in (state.X, state.A)
+        for by_class in (state.X, state.A, state.K)
     )
     used = tuple(mask & ~gone[:, None] for gone, mask in zip(lost, state.used, strict=True))
-    return state._replace(P=Blocks(P_arrays), E=Blocks(E_arrays), X=X, A=A, used=used, settled=False)
+    return state._replace(P=Blocks(P_arrays), E=Blocks(E_arrays), X=X, A=A, K=K, used=used, settled=False)
 
 
 def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State:
@@ -160,12 +163,11 @@ def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State
     picked = Picked.of(layout, model, before)
     flip, H = layout.flip, picked.H
     P, N, TM, w, T = _predict(layout, state, picked)
-    G = PH = flip(_rows(layout, H, P))
-    half_Pi = _rows(layout, H, 0.5 * PH)
-    if N is not None and TM is not None:
-        G = PH + N
-        half_Pi = _rows(layout, H, 0.5 * PH + N) - TM
-    half_Pi += picked.half_R
+    PH = flip(_rows(layout, H, P))
+    if N is None or TM is None:
+        G, half_Pi = PH, _rows(layout, H, 0.5 * PH) + picked.half_R
+    else:
+        G, half_Pi = PH + N, _rows(layout, H, 0.5 * PH + N) - TM + picked.half_R
     Pi = half_Pi + flip(half_Pi)
     A = tuple(map(_inverse, layout.own(Pi), used))
     X = tuple([own.copy() for own in layout.own(G)])
@@ -178,7 +180,7 @@ def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State
     P -= explained + flip(explained)
     settled = same and _settled(layout, state, P, Pi)
     gains = tuple([Gains(model.F, *parts) for parts in zip(w, H, T, K, strict=True)])
-    return State(P, E, Pi, X, A, used, gains, picked, settled)
+    return State(P, E, Pi, X, A, K, used, gains, picked, settled)
 
 
 class Picked(NamedTuple):
@@ -257,16 +259,28 @@ def _predict(
     half_P = Blocks([_side_by_side(0.5 * F, array) @ F.T + picked.half_Q for array in state.P.arrays])
     if noise is None:
         return half_P + flip(half_P), None, None, tuple(map(np.zeros_like, state.X)), tuple(map(np.zeros_like, state.A))
-    w, T = _products(noise.WA, state.A), _products(noise.VA, state.A)
-    FK = tuple([F @ K for K in _products(state.X, state.A)])
-    FE = Blocks([_side_by_side(F, array) for array in state.E.arrays])
-    told = _rows(layout, [-0.5 * np.concatenate(parts, axis=1) for parts in zip(w, T, strict=True)], state.Pi)
     nx = len(F)
-    M_w = flip(FE + Blocks([array[:, :nx] for array in told.arrays])) + noise.W
-    M_v = flip(Blocks([array[:, nx:] for array in told.arrays])) + noise.V
-    half_P -= _rows(layout, w, M_w) + _rows(layout, FK, noise.W)
-    N = noise.B - _rows(layout, w, M_v) - _rows(layout, FK, noise.V) - flip(_rows(layout, T, M_w))
-    return half_P + flip(half_P), N, _rows(layout, T, M_v), w, T
+    w, T = _products(noise.WA, state.A), _products(noise.VA, state.A)
+    U = [np.concatenate(parts, axis=1) for parts in zip(w, T, strict=True)]
+    FK = [F @ K for K in state.K]
+    told = _rows(layout, [-0.5 * parts for parts in U], state.Pi)
+    FE = Blocks([_side_by_side(F, array) for array in state.E.arrays])
+    M_w = flip(FE + _upper(told, nx)) + noise.W
+    M_v = flip(_lower(told, nx)) + noise.V
+    UM_w, UM_v = _rows(layout, U, M_w), _rows(layout, U, M_v)
+    half_P -= _upper(UM_w, nx) + _rows(layout, FK, noise.W)
+    N = noise.B - _upper(UM_v, nx) - _rows(layout, FK, noise.V) - flip(_lower(UM_w, nx))
+    return half_P + flip(half_P), N, _lower(UM_v, nx), w, T
+
+
+def _upper(X: Blocks, nx: int) -> Blocks:
+    """The first `nx` rows of each pair's matrix."""
+    return Blocks([array[:, :nx] for array in X.arrays])
+
+
+def _lower(X: Blocks, nx: int) -> Blocks:
+    """The others."""
+    return Blocks([array[:, nx:] for array in X.arrays])
 
 
 def _rows(layout: Layout, left: Sequence[Array], X: Blocks) -> Blocks:

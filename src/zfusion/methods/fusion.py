@@ -27,8 +27,8 @@ Two neighbours that used the same measurements have the same estimate; its diffe
 SMALLEST_EIGENVALUE = 1e-10
 """Eigenvalues of Z, scaled to a unit diagonal, below this are zero: those differences determine each other.
 
-The estimates of nodes that lost a few of each other's messages converge, and their differences become so small that Z is
-mostly rounding: with 1e-12 that costs up to 1e-5 of Σ, with 1e-10 less than 1e-7, which is also all that can be lost."""
+The estimates of nodes that lost a few of each other's messages converge, and their differences become so small that
+Z is mostly rounding: with 1e-12 that costs up to 1e-5 of Σ, with 1e-10 less than 1e-7, all that it can lose."""
 
 
 def fusion_weights(own: Array, cross: Array, among: Array, prior: Array) -> tuple[Array, Array]:

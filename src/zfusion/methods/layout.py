@@ -149,7 +149,7 @@ class Layout:
         if len(by_class) == 1:
             return by_class[0]
         members = [i for c in self.classes for i in c.members]
-        order = sorted(range(len(members)), key=lambda at: members[at])  # type: ignore[arg-type, return-value]
+        order = sorted(range(len(members)), key=lambda at: members[at])
         return np.concatenate(by_class)[order]
 
     def among(self, nodes: Sequence[NodeId], nx: int) -> Ints:

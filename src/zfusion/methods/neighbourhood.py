@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import NamedTuple
 
-import numpy as np
-
 from zfusion.methods.covariances import State, advance, forget, prior
 from zfusion.methods.layout import Ints, Layout, Used
 from zfusion.model.statistics import PriorMoments, StepModel

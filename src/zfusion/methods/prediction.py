@@ -44,10 +44,10 @@ def predict(system: System, network: Network, steps: int) -> Prediction:
     Raises RunError where the state outgrows what can be computed with (`step_models`).
     """
     ids = network.ids
-    local = _Filters(system, {i: (i,) for i in ids})
-    intermediate = _Filters(system, network.neighbourhoods, _with_common_listener(network))
-    centralized = _Filters(system, {ids[0]: ids})
-    fusion = _Fusion(network, intermediate.layout, system.nx)
+    local = Filters(system, {i: (i,) for i in ids})
+    intermediate = Filters(system, network.neighbourhoods, with_common_listener(network))
+    centralized = Filters(system, {ids[0]: ids})
+    fusion = Fusions(network, intermediate.layout, system.nx)
     shape = (steps + 1, len(ids), system.nx, system.nx)
     prediction = Prediction(ids, np.empty(shape), np.empty(shape), np.empty(shape), np.empty((shape[0], *shape[2:])))
     moments, models = prior_moments(system), step_models(system, ids)
@@ -63,7 +63,7 @@ def predict(system: System, network: Network, steps: int) -> Prediction:
     return prediction
 
 
-class _Filters:
+class Filters:
     """The filters of several nodes, of which each uses all measurements of its neighbourhood at every step."""
 
     def __init__(
@@ -77,6 +77,7 @@ class _Filters:
         self._used = self.layout.used(neighbourhoods)
 
     def advance(self, model: StepModel) -> None:
+        """To the next step, whose statistics are those of all sensors."""
         self.state = advance(self.layout, self.state, model, self._used)
 
     @property
@@ -85,7 +86,7 @@ class _Filters:
         return self.layout.in_order(self.layout.own(self.state.P))
 
 
-class _Fusion:
+class Fusions:
     """Stage 2 at every node, nodes of one degree together."""
 
     def __init__(self, network: Network, layout: Layout, nx: int) -> None:
@@ -113,6 +114,7 @@ class _Fusion:
         return fused
 
 
-def _with_common_listener(network: Network) -> Iterator[tuple[NodeId, NodeId]]:
+def with_common_listener(network: Network) -> Iterator[tuple[NodeId, NodeId]]:
+    """The pairs of nodes whose estimates somebody fuses; some of them more than once."""
     for i in network.ids:
         yield from combinations(network.neighbours(i), 2)
