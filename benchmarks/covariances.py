@@ -6,7 +6,7 @@ Per step, while nothing has settled, everything in one process and one thread, i
 
     node       all that one node of degree 6 does: its own filter, the pairs of its neighbourhood, the fusion, the data
     network    intermediate and fused covariances of all nodes, each pair once
-    printed    the same by `tests/oracles/printed_form.py`: each node all that it needs, as in the paper, or each pair once
+    printed    the same by `tests/oracles/printed_form.py`: each node what it needs, as in the paper; or each pair once
 
 and what a node's step costs once all has settled. The system is the paper's example with two states and more sensors:
 a noise common to all of them, correlated over time and with the process noise.
@@ -28,8 +28,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
-from oracles import paper, printed_form
 
+from oracles import paper, printed_form
 from zfusion.methods import Fields, Setting
 from zfusion.methods.prediction import Filters, Fusions, with_common_listener
 from zfusion.methods.two_stage import TwoStage
@@ -119,12 +119,12 @@ def printed_shared_steps(system: System, network: Network) -> Iterator[None]:
 
 
 def seconds_a_step(starts: dict[str, Callable[[], Iterator[None]]], repetitions: int) -> dict[str, float]:
-    """Median time of a step of each, taken in turn, step by step."""
+    """Median time of a step of each; they take turns, a few steps each."""
     times: dict[str, list[float]] = {name: [] for name in starts}
     for _ in range(repetitions):
-        running = {name: start() for name, start in starts.items()}
-        for step in range(STEPS):
-            for name, steps in running.items():
+        for name, start in starts.items():
+            steps = start()
+            for step in range(STEPS):
                 began = time.perf_counter()
                 next(steps)
                 if step > 1:  # the first steps also arrange things

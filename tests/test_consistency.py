@@ -14,7 +14,7 @@ import pytest
 from oracles import paper, random_systems, tracking
 from oracles.brute_force import Used, always
 from zfusion.methods.covariances import Gains, advance, prior
-from zfusion.methods.fusion import fusion_weights
+from zfusion.methods.fusion import fusion_weights, joint_index
 from zfusion.methods.layout import Layout
 from zfusion.model.sampling import SamplePath
 from zfusion.model.statistics import step_models
@@ -74,8 +74,8 @@ def estimate(
         for row, i in enumerate(nodes):
             members = [i, *(j for j in heard[i, k] if j != i)]
             rows = [nodes.index(j) for j in members]
-            P = state.P.flat.take(layout.among(members, nx))
-            weights, covariance = fusion_weights(P[0, 0], P[0, 1:], P[1:, 1:], moments.covariance)
+            joint = state.P.flat.take(joint_index(layout, members, nx))
+            weights, covariance = fusion_weights(joint, moments.covariance)
             z = np.concatenate(
                 [np.broadcast_to(moments.mean, x[row].shape) - x[row], *(x[r] - x[row] for r in rows[1:])], 1
             )

@@ -25,10 +25,15 @@ KINDS: list[dict[str, Any]] = [
 ]
 
 
-def covariance_blocks(estimates: Sequence[Estimates], k: int) -> tuple[Array, Array, Array]:
-    """P^(ii), P^(ij) and P^(jl), the first of the estimates being i's."""
-    P = np.array([[e.errors[k] @ f.errors[k].T for f in estimates] for e in estimates])
-    return P[0, 0], P[0, 1:], P[1:, 1:]
+def joint(estimates: Sequence[Estimates], k: int) -> Array:
+    """What `fusion_weights` takes, for i's estimate, the first, and the others'."""
+    errors = [estimates[0].errors[k], *(e.errors[k] for e in estimates)]  # the second stands for the prior
+    P = np.block([[e @ f.T for f in errors] for e in errors])
+    nx = len(errors[0])
+    for at, e in enumerate(errors):
+        row = slice(nx * at, nx * (at + 1))
+        P[row, nx : 2 * nx] = P[nx : 2 * nx, row] = e @ e.T
+    return P
 
 
 def in_terms_of_measurements(weights: Array, estimates: Sequence[Estimates], k: int) -> Array:
@@ -60,7 +65,7 @@ def test_it_is_the_best_affine_combination_of_what_was_heard(kind: dict[str, Any
         for k in range(1, STEPS + 1):
             members = [estimates[j] for j in (i, *sorted(set(heard[i, k]) - {i}))]
             prior = stacked.state[k] @ stacked.state[k].T
-            weights, covariance = fusion_weights(*covariance_blocks(members, k), prior)
+            weights, covariance = fusion_weights(joint(members, k), prior)
             scale = np.abs(wanted.covariance[k]).max()
             np.testing.assert_allclose(covariance, wanted.covariance[k], rtol=0, atol=1e-8 * scale)
             difference = in_terms_of_measurements(weights, members, k) - wanted.weights[k]
@@ -72,11 +77,11 @@ def test_a_batch_of_fusions_is_each_of_them() -> None:
     stacked, estimates, _, _ = random_fusions({"nx": 2}, 0)
     k, ids = 5, sorted(estimates)
     rows = [[estimates[j] for j in (i, *[j for j in ids if j != i][:2])] for i in ids]
-    blocks = [covariance_blocks(row, k) for row in rows]
+    joints = np.array([joint(row, k) for row in rows])
     prior = stacked.state[k] @ stacked.state[k].T
-    weights, covariances = fusion_weights(*(np.array(part) for part in zip(*blocks, strict=True)), prior)
-    for n, parts in enumerate(blocks):
-        one, covariance = fusion_weights(*parts, prior)
+    weights, covariances = fusion_weights(joints, prior)
+    for n, alone in enumerate(joints):
+        one, covariance = fusion_weights(alone, prior)
         np.testing.assert_allclose(weights[n], one, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(covariances[n], covariance, rtol=1e-12, atol=1e-14)
 
@@ -105,19 +110,19 @@ def test_twins_have_no_weight_and_do_no_harm() -> None:
     stacked, estimates, _, _ = random_fusions({"nx": 3}, 1)
     k, (i, j, *_) = 6, sorted(estimates)
     prior = stacked.state[k] @ stacked.state[k].T
-    _, wanted = fusion_weights(*covariance_blocks([estimates[i], estimates[j]], k), prior)
+    _, wanted = fusion_weights(joint([estimates[i], estimates[j]], k), prior)
     for twins in ([i, j, j], [i, j, i], [i, i, j, j, i]):
-        weights, covariance = fusion_weights(*covariance_blocks([estimates[t] for t in twins], k), prior)
+        weights, covariance = fusion_weights(joint([estimates[t] for t in twins], k), prior)
         np.testing.assert_allclose(covariance, wanted, rtol=1e-9, atol=1e-12)
         assert np.isfinite(weights).all()
-    weights, covariance = fusion_weights(*covariance_blocks([estimates[i], estimates[i]], k), prior)
+    weights, covariance = fusion_weights(joint([estimates[i], estimates[i]], k), prior)
     assert not weights[:, 3:].any()
 
 
 def test_alone_the_own_estimate_is_the_best() -> None:
     rng = np.random.default_rng(4)
     P = random_systems.random_covariance(rng, 3)
-    weights, covariance = fusion_weights(P, np.zeros((0, 3, 3)), np.zeros((0, 0, 3, 3)), 7 * np.eye(3))
+    weights, covariance = fusion_weights(np.tile(P, (2, 2)), 7 * np.eye(3))
     assert weights.shape == (3, 3)
     assert not weights.any()
     np.testing.assert_array_equal(covariance, P)
@@ -125,7 +130,7 @@ def test_alone_the_own_estimate_is_the_best() -> None:
 
 def test_before_anything_arrived_everybody_has_the_prior() -> None:
     P = random_systems.random_covariance(np.random.default_rng(5), 2)
-    weights, covariance = fusion_weights(P, np.array([P, P]), np.array([[P, P], [P, P]]), P)
+    weights, covariance = fusion_weights(np.tile(P, (4, 4)), P)
     assert not weights.any()
     np.testing.assert_array_equal(covariance, P)
 
@@ -133,17 +138,17 @@ def test_before_anything_arrived_everybody_has_the_prior() -> None:
 def test_a_prior_that_is_infinite_knows_nothing() -> None:
     _, estimates, _, _ = random_fusions({"nx": 2}, 2)
     members = [estimates[i] for i in sorted(estimates)[:3]]
-    blocks = covariance_blocks(members, 5)
-    weights, covariance = fusion_weights(*blocks, np.full((2, 2), np.inf))
+    weights, covariance = fusion_weights(joint(members, 5), np.full((2, 2), np.inf))
     assert not weights[:, :2].any()
-    far, nearly = fusion_weights(*blocks, 1e14 * np.eye(2))
+    far, nearly = fusion_weights(joint(members, 5), 1e14 * np.eye(2))
     np.testing.assert_allclose(covariance, nearly, rtol=1e-8)
     np.testing.assert_allclose(weights, far, rtol=1e-6, atol=1e-8)
 
 
 def test_errors_that_are_exactly_zero() -> None:
-    zero = np.zeros((2, 2))
-    weights, covariance = fusion_weights(zero, np.array([zero]), np.array([[np.eye(2)]]), 2 * np.eye(2))
+    P = np.zeros((6, 6))
+    P[4:, 4:] = np.eye(2)
+    weights, covariance = fusion_weights(P, 2 * np.eye(2))
     assert not weights.any()
     assert not covariance.any()
 
@@ -162,7 +167,7 @@ def test_estimates_that_all_but_agree() -> None:
     for k in range(1, steps + 1):
         members = [estimates[i] for i in system.ids]
         prior = stacked.state[k] @ stacked.state[k].T
-        weights, covariance = fusion_weights(*covariance_blocks(members, k), prior)
+        weights, covariance = fusion_weights(joint(members, k), prior)
         error = stacked.state[k] - in_terms_of_measurements(weights, members, k) @ stacked.readings
         scale = np.abs(best.covariance[k]).max()
         np.testing.assert_allclose(error @ error.T, covariance, rtol=0, atol=1e-7 * scale)

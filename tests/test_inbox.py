@@ -10,12 +10,11 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from swarms import wait_until
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import STRETCH_NS, Inbox, Wake
 from zfusion.drivers.transport import open_session
 from zfusion.swarm.launch import free_endpoints
-
-from swarms import wait_until
 
 SOON_NS = 20_000_000_000
 """Far later than anything here takes; a wait that lasts until then has not been ended."""

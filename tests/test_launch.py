@@ -10,6 +10,7 @@ from typing import Any
 import jsonschema
 import pytest
 from mcap.reader import make_reader
+
 from swarms import EXAMPLE, Result, estimates, launch, recorded, run_name, variant, zfusion
 
 STEPS = 300

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import msgpack
 import pytest
 import zenoh
+
 from swarms import (
     EXAMPLE,
     Command,
@@ -25,7 +27,6 @@ from swarms import (
     variant,
     wait_until,
 )
-
 from zfusion.swarm.launch import free_endpoints
 
 NODES = (1, 2, 3, 4)
@@ -122,9 +123,7 @@ def test_one_put_a_message_whoever_listens(outsider: Outsider) -> None:
 
 
 def test_everybody_shows_that_he_is_there(outsider: Outsider) -> None:
-    wait_until(
-        lambda: outsider.watch() == {f"zfusion/{outsider.run}/node/{i}" for i in NODES}, "tokens of all nodes"
-    )
+    wait_until(lambda: outsider.watch() == {f"zfusion/{outsider.run}/node/{i}" for i in NODES}, "tokens of all nodes")
 
 
 def test_nodes_answer_how_they_are_doing(outsider: Outsider) -> None:
@@ -150,9 +149,7 @@ def test_nodes_answer_what_they_used(outsider: Outsider) -> None:
 def started_by_hand(
     directory: Path, scenario: Path, run: str, nodes: tuple[int, ...], *words: object
 ) -> dict[int, Command]:
-    return {
-        i: Command(directory, "node", scenario, "--id", i, "--run", run, "--json", *words) for i in nodes
-    }
+    return {i: Command(directory, "node", scenario, "--id", i, "--run", run, "--json", *words) for i in nodes}
 
 
 def pair(directory: Path, name: str = "pair", **tables: Any) -> Path:
@@ -256,8 +253,9 @@ def test_endpoints_that_cannot_be_are_refused(directory: Path) -> None:
 
 def test_a_zenoh_configuration_of_the_users_rules(directory: Path) -> None:
     [endpoint] = free_endpoints(1)
+    quiet = {"multicast": {"enabled": False}}
     (directory / "zenoh.json5").write_text(
-        '{ mode: "peer", listen: { endpoints: ["%s"] }, scouting: { multicast: { enabled: false } } }' % endpoint
+        json.dumps({"mode": "peer", "listen": {"endpoints": [endpoint]}, "scouting": quiet})
     )
     scenario = pair(directory, "configured", transport={"zenoh_config": "zenoh.json5"})
     run = run_name("configured")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from oracles import random_systems
 from zfusion.methods import neighbourhood
 from zfusion.methods.covariances import State, advance, prior
+from zfusion.methods.fusion import joint_index
 from zfusion.methods.layout import Layout
 from zfusion.methods.neighbourhood import Neighbourhood, StepModels
 from zfusion.model.statistics import prior_moments, step_models
@@ -57,13 +58,9 @@ def fresh(system: System, histories: Mapping[NodeId, History], steps: int) -> tu
 def assert_exact(tracked: Neighbourhood, known: frozenset[NodeId], truth: tuple[Layout, State]) -> None:
     """The blocks of all that are called exact are those of the fresh recursion."""
     layout, state = truth
-    others = sorted(known - {OWN})
-    own, cross, among = tracked.blocks(others)
-    wanted = state.P.flat.take(layout.among((OWN, *others), 2))
-    found = np.empty_like(wanted)
-    found[0, 0], found[0, 1:], found[1:, 1:] = own, cross, among
-    found[1:, 0] = cross.swapaxes(-1, -2)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+    others = tuple(sorted(known - {OWN}))
+    wanted = state.P.flat.take(joint_index(layout, (OWN, *others), 2))
+    np.testing.assert_allclose(tracked.joint(others), wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
 
 
 class Story:

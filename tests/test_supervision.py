@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from swarms import (
     EXAMPLE,
     Command,
@@ -28,7 +29,6 @@ from swarms import (
     wait_until,
     zfusion,
 )
-
 from zfusion.recording import Recording
 
 NODES = ["1", "2", "3", "4"]
@@ -92,9 +92,7 @@ ENDLESS = 1_000_000
 
 def intermediates(messages: list[Recorded], node: int) -> dict[int, list[int]]:
     """Step -> whose measurements the node used."""
-    return {
-        m.payload["step"]: m.payload["used"] for m in messages if m.topic.endswith(f"/node/{node}/intermediate")
-    }
+    return {m.payload["step"]: m.payload["used"] for m in messages if m.topic.endswith(f"/node/{node}/intermediate")}
 
 
 @pytest.mark.parametrize("timing", [PACED["timing"], {"free_run": True, "rate_hz": None}], ids=["paced", "free"])
@@ -251,7 +249,10 @@ def test_what_cannot_be_launched_is_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_a_source_that_fails_later_is_told_with_its_words(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(
-        "def read(step, t_ns, node):\n    if node == 3 and step > 5:\n        raise OSError('unplugged')\n    return 1.0\n"
+        "def read(step, t_ns, node):\n"
+        "    if node == 3 and step > 5:\n"
+        "        raise OSError('unplugged')\n"
+        "    return 1.0\n"
     )
     scenario = variant(tmp_path, source={"kind": "python", "function": "bad.py:read"})
     result = launch(tmp_path, scenario, "--free-run", "--steps", 40, "--no-record")

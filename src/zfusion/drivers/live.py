@@ -60,8 +60,8 @@ AHEAD = 65_536
 was restarted follows it."""
 
 QUESTIONS = frozenset({"status?", "history?"})
-"""Notices of queries. Each must be dropped explicitly, answered or not: Python would drop it holding its global lock, and
-Zenoh's thread may be waiting for that while it holds what dropping needs."""
+"""Notices of queries. Each must be dropped explicitly, answered or not: Python would drop it holding its global lock,
+and Zenoh's thread may be waiting for that while it holds what dropping needs."""
 
 MAX_NOTICES = 4096
 """Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""

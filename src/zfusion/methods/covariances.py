@@ -165,10 +165,13 @@ def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State
     P, N, TM, w, T = _predict(layout, state, picked)
     PH = flip(_rows(layout, H, P))
     if N is None or TM is None:
-        G, half_Pi = PH, _rows(layout, H, 0.5 * PH) + picked.half_R
+        G, half_Pi = PH, _rows(layout, H, 0.5 * PH)
     else:
-        G, half_Pi = PH + N, _rows(layout, H, 0.5 * PH + N) - TM + picked.half_R
-    Pi = half_Pi + flip(half_Pi)
+        G, half_Pi = PH + N, _rows(layout, H, 0.5 * PH + N)
+        half_Pi -= TM
+    half_Pi += picked.half_R
+    Pi = flip(half_Pi)
+    Pi += half_Pi
     A = tuple(map(_inverse, layout.own(Pi), used))
     X = tuple([own.copy() for own in layout.own(G)])
     K = _products(X, A)
@@ -177,7 +180,8 @@ def advance(layout: Layout, state: State, model: StepModel, used: Used) -> State
     for own in layout.own(E):
         own[...] = 0.0
     explained = _rows(layout, K, flip(G - 0.5 * KPi))
-    P -= explained + flip(explained)
+    explained += flip(explained)
+    P -= explained
     settled = same and _settled(layout, state, P, Pi)
     gains = tuple([Gains(model.F, *parts) for parts in zip(w, H, T, K, strict=True)])
     return State(P, E, Pi, X, A, K, used, gains, picked, settled)
@@ -191,8 +195,8 @@ class Picked(NamedTuple):
     """H̄_k at each node's slots, (size, nx)."""
     half_R: Blocks
     """½ C_l R C_jᵀ, (size, size)."""
-    half_Q: Array
-    """½ Q + F̄ Q1ᵀ, (nx, 1, nx)."""
+    half_Q: Blocks
+    """½ Q + F̄ Q1ᵀ for each pair of one node, (1, nx, r, nx)."""
     noise: PickedNoise | None
     """None where the noises are white."""
 
@@ -205,13 +209,13 @@ class Picked(NamedTuple):
                 return before
             if model.H is old.H and model.W is old.W and model.V is old.V and model.B is old.B:
                 half_R = before.half_R if model.R is old.R else layout.pick(0.5 * model.R)
-                return before._replace(model=model, half_R=half_R, half_Q=_half_noise(model))
+                return before._replace(model=model, half_R=half_R, half_Q=_half_noise(layout, model))
         correlated = model.W.any() or model.V.any() or model.B.any()
         return cls(
             model=model,
             H=tuple(model.H[c.slots] for c in layout.classes),
             half_R=layout.pick(0.5 * model.R),
-            half_Q=_half_noise(model),
+            half_Q=_half_noise(layout, model),
             noise=PickedNoise.of(layout, model) if correlated else None,
         )
 
@@ -246,9 +250,9 @@ class PickedNoise(NamedTuple):
         )
 
 
-def _half_noise(model: StepModel) -> Array:
-    half: Array = 0.5 * model.Q + model.F @ model.Q1.T
-    return half[:, None, :]
+def _half_noise(layout: Layout, model: StepModel) -> Blocks:
+    half = 0.5 * model.Q + model.F @ model.Q1.T
+    return Blocks([np.repeat(half[None, :, None, :], block.partners.shape[1], axis=2) for block in layout.blocks])
 
 
 def _predict(
@@ -256,30 +260,36 @@ def _predict(
 ) -> tuple[Blocks, Blocks | None, Blocks | None, ByClass, ByClass]:
     """P⁻, N, T_l M_v, w_l and T_l; None for N and T_l M_v where the noises are white."""
     F, noise, flip = picked.model.F, picked.noise, layout.flip
-    half_P = Blocks([_side_by_side(0.5 * F, array) @ F.T + picked.half_Q for array in state.P.arrays])
+    nx = len(F)
+    half_P = Blocks([_side_by_side(0.5 * F, array) @ F.T for array in state.P.arrays])
+    half_P += picked.half_Q
     if noise is None:
         return half_P + flip(half_P), None, None, tuple(map(np.zeros_like, state.X)), tuple(map(np.zeros_like, state.A))
-    nx = len(F)
     w, T = _products(noise.WA, state.A), _products(noise.VA, state.A)
     U = [np.concatenate(parts, axis=1) for parts in zip(w, T, strict=True)]
     FK = [F @ K for K in state.K]
-    told = _rows(layout, [-0.5 * parts for parts in U], state.Pi)
+    told = _rows(layout, [-0.5 * matrix for matrix in U], state.Pi)
     FE = Blocks([_side_by_side(F, array) for array in state.E.arrays])
-    M_w = flip(FE + _upper(told, nx)) + noise.W
-    M_v = flip(_lower(told, nx)) + noise.V
+    M_w, M_v = flip(FE + _upper(told, nx)), flip(told, nx)
+    M_w += noise.W
+    M_v += noise.V
     UM_w, UM_v = _rows(layout, U, M_w), _rows(layout, U, M_v)
-    half_P -= _upper(UM_w, nx) + _rows(layout, FK, noise.W)
-    N = noise.B - _upper(UM_v, nx) - _rows(layout, FK, noise.V) - flip(_lower(UM_w, nx))
-    return half_P + flip(half_P), N, _lower(UM_v, nx), w, T
+    half_P -= _upper(UM_w, nx)
+    half_P -= _rows(layout, FK, noise.W)
+    half_P += flip(half_P)
+    N = noise.B - _upper(UM_v, nx)
+    N -= _rows(layout, FK, noise.V)
+    N -= flip(UM_w, nx)
+    return half_P, N, _lower(UM_v, nx), w, T
 
 
 def _upper(X: Blocks, nx: int) -> Blocks:
-    """The first `nx` rows of each pair's matrix."""
+    """The first `nx` rows of every matrix."""
     return Blocks([array[:, :nx] for array in X.arrays])
 
 
 def _lower(X: Blocks, nx: int) -> Blocks:
-    """The others."""
+    """The other rows."""
     return Blocks([array[:, nx:] for array in X.arrays])
 
 

@@ -5,7 +5,7 @@ reference, z_j = x̂^j - x̂^i for the neighbours and z_0 = m - x̂^i for the pr
 
     x̂_fused = x̂^i + c Z⁺ z,   Σ = P^(ii) - c Z⁺ cᵀ
     c_j = P^(ii) - P^(ij),    Z_jl = P^(ii) - P^(il) - P^(ji) + P^(jl)
-    prior: P^(0l) = P^(l0) = P^(ll), so c_0 = 0 and Z_0l = P^(ll) - P^(il);   Z_00 = Cov[x_k] - P^(ii)
+    prior: P^(0l) = P^(l0) = P^(ll) and P^(00) = Cov[x_k], so that c_0 = 0
 
 It is Theorem 2 exactly where m = 0, never worse elsewhere, and does not depend on where the origin lies.
 """
@@ -13,11 +13,13 @@ It is Theorem 2 exactly where m = 0, never worse elsewhere, and does not depend 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
 from zfusion.methods.covariances import SMALLEST_VARIANCE
-from zfusion.model.types import Array
+from zfusion.methods.layout import Ints, Layout
+from zfusion.model.types import Array, NodeId
 
 TWIN = 1e-13
 """A difference of estimates whose variance is below this fraction of the own error's variance is rounding.
@@ -30,37 +32,52 @@ SMALLEST_EIGENVALUE = 1e-10
 The estimates of nodes that lost a few of each other's messages converge, and their differences become so small that
 Z is mostly rounding: with 1e-12 that costs up to 1e-5 of Σ, with 1e-10 less than 1e-7, all that it can lose."""
 
+REGULAR_PIVOT = 1e-7
+"""With all pivots above this, Z has no eigenvalue that would be taken as zero: it is solved as it is."""
 
-def fusion_weights(own: Array, cross: Array, among: Array, prior: Array) -> tuple[Array, Array]:
+
+def joint_index(layout: Layout, nodes: Sequence[NodeId], nx: int) -> Ints:
+    """Where in `State.P.flat` the matrix stands that `fusion_weights` takes, for the own node and then the others.
+
+    In the place of P^(00) there is something else of the same size.
+    """
+    where = layout.among(nodes, nx)
+    c = len(nodes)
+    order = np.array([0, 0, *range(1, c)])  # the prior after the own node
+    index = where[order[:, None], order]
+    each = where[np.arange(c), np.arange(c)][order]
+    index[1, :], index[:, 1] = each, each
+    return index.swapaxes(1, 2).reshape((1 + c) * nx, (1 + c) * nx)
+
+
+def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
     """Weights of the differences z = (z_0, z_1, ...) and the covariance of the fused error.
 
     Args:
-        own: P^(ii), (..., nx, nx).
-        cross: P^(ij) for the d neighbours j that are fused, (..., d, nx, nx).
-        among: P^(jl) of those neighbours, (..., d, d, nx, nx).
-        prior: Cov[x_k], (nx, nx). Where it is not finite (an unstable system, long after its start) the prior
-            knows nothing and has no weight.
+        joint: covariances of the errors of x̂^i, of the prior mean and of the x̂^j of the d neighbours that are fused,
+            (..., (2 + d) nx, (2 + d) nx), all but P^(00), in whose place there may be anything finite.
+        prior: P^(00) = Cov[x_k], (nx, nx). Where it is not finite (an unstable system, long after its start) the
+            prior knows nothing and has no weight.
 
     Returns:
         (weights, Σ): (..., nx, (1 + d) nx), the prior's columns first, and (..., nx, nx).
     """
-    *batch, d, nx, _ = cross.shape
-    n = (1 + d) * nx
-    c = np.zeros((*batch, nx, 1 + d, nx))
-    c[..., 1:, :] = (own[..., None, :, :] - cross).swapaxes(-3, -2)
-    Z = np.zeros((*batch, 1 + d, 1 + d, nx, nx))
-    Z[..., 1:, 1:, :, :] = (
-        own[..., None, None, :, :] - cross[..., None, :, :, :] - cross.swapaxes(-1, -2)[..., None, :, :] + among
-    )
-    if np.isfinite(prior).all():
-        each = np.arange(d)
-        Z[..., 0, 0, :, :] = prior - own
-        Z[..., 0, 1:, :, :] = among[..., each, each, :, :] - cross
-        Z[..., 1:, 0, :, :] = Z[..., 0, 1:, :, :].swapaxes(-1, -2)
-    Z = Z.swapaxes(-3, -2).reshape(*batch, n, n)
-    c = c.reshape(*batch, nx, n)
-    variances = np.einsum("...aa->...a", own)
-    weights: Array = c @ _pseudo_inverse(Z, np.concatenate((variances,) * (1 + d), axis=-1))
+    nx = len(prior)
+    known = np.isfinite(prior).all()
+    joint[..., nx : 2 * nx, nx : 2 * nx] = prior if known else 0.0
+    difference = _differences(joint.shape[-1] // nx - 1, nx)
+    own = joint[..., :nx, :nx]
+    c = joint[..., :nx, :] @ difference.T
+    Z = difference @ joint @ difference.T
+    reference = np.concatenate((own.diagonal(0, -2, -1),) * (Z.shape[-1] // nx), axis=-1)
+    variance = Z.diagonal(0, -2, -1)
+    alive = variance > np.maximum(TWIN * reference, SMALLEST_VARIANCE)
+    if not known:
+        alive[..., :nx] = False
+    scale = alive / np.sqrt(np.where(alive, variance, 1.0))
+    unit = Z * (scale[..., :, None] * scale[..., None, :])
+    np.einsum("...aa->...a", unit)[...] = 1.0
+    weights = _solve(unit, c * scale[..., None, :]) * scale[..., None, :]
     gained = weights @ c.swapaxes(-1, -2)
     return weights, own - 0.5 * (gained + gained.swapaxes(-1, -2))
 
@@ -72,14 +89,24 @@ def fuse(own: Array, others: Sequence[Array], mean: Array, weights: Array) -> Ar
     return fused
 
 
-def _pseudo_inverse(Z: Array, reference: Array) -> Array:
-    """Z⁺ on the unit-diagonal scaling; rows of variance below TWIN times `reference` have no part in it."""
-    variance = np.einsum("...aa->...a", Z)
-    alive = variance > np.maximum(TWIN * reference, SMALLEST_VARIANCE)
-    scale = alive / np.sqrt(np.where(alive, variance, 1.0))
-    scales = scale[..., :, None] * scale[..., None, :]
-    values, vectors = np.linalg.eigh(Z * scales)
+@cache
+def _differences(count: int, nx: int) -> Array:
+    """(e^i - e^0; e^i - e^1; ...) in terms of (e^i; e^0; e^1; ...), (count nx, (1 + count) nx)."""
+    return np.kron(np.hstack((np.ones((count, 1)), -np.eye(count))), np.eye(nx))
+
+
+def _solve(unit: Array, c: Array) -> Array:
+    """c Z⁺ for covariance matrices Z with unit diagonals, (..., n, n), and c (..., nx, n)."""
+    try:
+        pivots = np.linalg.cholesky(unit).diagonal(0, -2, -1)
+        regular = pivots.min(initial=1.0) ** 2 > REGULAR_PIVOT
+    except np.linalg.LinAlgError:
+        regular = False
+    if regular:
+        solution: Array = np.linalg.solve(unit, c.swapaxes(-1, -2))
+        return solution.swapaxes(-1, -2)
+    values, vectors = np.linalg.eigh(unit)
     kept = values > SMALLEST_EIGENVALUE
-    scaled: Array = vectors * (kept / np.where(kept, values, 1.0))[..., None, :]
-    pseudo: Array = scaled @ vectors.swapaxes(-1, -2) * scales
-    return pseudo
+    inverse = kept / np.where(kept, values, 1.0)
+    projected: Array = (c @ vectors) * inverse[..., None, :]
+    return projected @ vectors.swapaxes(-1, -2)

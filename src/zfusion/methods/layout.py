@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import product
 from operator import add, sub
 
@@ -34,7 +35,10 @@ calls cost more than the numbers do."""
 
 
 class Blocks:
-    """A matrix for each pair of nodes: one array (n, rows, r, columns) for every two classes."""
+    """A matrix for each pair of nodes: one array (n, rows, r, columns) for every two classes.
+
+    They are megabytes in a large network: `+=` and `-=` change the arrays that are there.
+    """
 
     __slots__ = ("arrays",)
 
@@ -47,6 +51,16 @@ class Blocks:
 
     def __sub__(self, other: Blocks) -> Blocks:
         return self._with(sub, other)
+
+    def __iadd__(self, other: Blocks) -> Blocks:
+        for array, more in zip(self.arrays, other.arrays, strict=True):
+            np.add(array, more, out=array)
+        return self
+
+    def __isub__(self, other: Blocks) -> Blocks:
+        for array, less in zip(self.arrays, other.arrays, strict=True):
+            np.subtract(array, less, out=array)
+        return self
 
     def __rmul__(self, factor: float) -> Blocks:
         return Blocks([factor * array for array in self.arrays])
@@ -107,7 +121,7 @@ class Layout:
     """Size of Y, the stack of all measurements."""
     _place: Mapping[NodeId, Mapping[NodeId, int]] = field(repr=False)
     """l -> j -> where j stands among l's partners in the block of their classes."""
-    _indices: dict[tuple[int, int, int], Ints] = field(default_factory=dict, init=False, repr=False)
+    _flips: dict[tuple[int, int, int, int], Ints] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def build(
@@ -167,31 +181,35 @@ class Layout:
             first[a, b] = start + (at * nx * widths[number] + self._place[i][j]) * nx
         return first + np.arange(nx)[:, None] * (width * nx) + np.arange(nx)
 
-    def flip(self, X: Blocks) -> Blocks:
-        """Xᶠ: every pair the other way round, X^(jl)ᵀ in the place of (l, j); (n, a, r, b) becomes (n, b, r, a)."""
-        return Blocks([self._flipped(number, X.arrays[block.mirror]) for number, block in enumerate(self.blocks)])
+    def flip(self, X: Blocks, first: int = 0) -> Blocks:
+        """Xᶠ: every pair the other way round, X^(jl)ᵀ in the place of (l, j); (n, a, r, b) becomes (n, b, r, a).
 
-    def _flipped(self, number: int, X: Array) -> Array:
+        With `first`, only of the rows of X from there on.
+        """
+        arrays = X.arrays
+        return Blocks([self._flipped(number, arrays[b.mirror], first) for number, b in enumerate(self.blocks)])
+
+    def _flipped(self, number: int, X: Array, first: int) -> Array:
         _, rows, r, columns = X.shape
-        index = self._indices.get((number, rows, columns))
+        index = self._flips.get((number, rows, columns, first))
         if index is None:
             block = self.blocks[number]
             start = block.partners * (rows * r * columns) + block.back * columns
-            steps = np.arange(columns)[:, None, None] + np.arange(rows) * (r * columns)
-            index = self._indices[number, rows, columns] = start[:, None, :, None] + steps
-        return X.reshape(-1).take(index)
+            steps = np.arange(columns)[:, None, None] + np.arange(first, rows) * (r * columns)
+            index = self._flips[number, rows, columns, first] = start[:, None, :, None] + steps
+        return X.reshape(-1).take(index, mode="wrap")  # the indices are right: the fastest of the modes
 
     def pick(self, matrix: Array) -> Blocks:
         """Parts of a matrix over Y, (ny, ny): for (l, j) the rows of l's slots and the columns of j's."""
-        return Blocks([matrix.reshape(-1).take(self._pick_index(number)) for number in range(len(self.blocks))])
+        return Blocks([matrix.reshape(-1).take(index) for index in self._picks])
 
-    def _pick_index(self, number: int) -> Ints:
-        index = self._indices.get((number, 0, 0))
-        if index is None:
-            block = self.blocks[number]
-            rows, columns = self.classes[block.left].slots, self.classes[block.right].slots[block.partners]
-            index = self._indices[number, 0, 0] = rows[:, :, None, None] * self.ny + columns[:, None, :, :]
-        return index
+    @cached_property
+    def _picks(self) -> list[Ints]:
+        slots = [c.slots for c in self.classes]
+        return [
+            slots[block.left][:, :, None, None] * self.ny + slots[block.right][block.partners][:, None, :, :]
+            for block in self.blocks
+        ]
 
 
 Slots = Mapping[NodeId, Sequence[tuple[NodeId, int]]]

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import NamedTuple
 
 from zfusion.methods.covariances import State, advance, forget, prior
+from zfusion.methods.fusion import joint_index
 from zfusion.methods.layout import Ints, Layout, Used
 from zfusion.model.statistics import PriorMoments, StepModel
 from zfusion.model.types import Array, NodeId
@@ -31,7 +32,7 @@ of milliseconds, so that it keeps its own deadlines meanwhile."""
 UNSETTLED = 16
 """What a step costs whose covariances have to be computed, in steps of settled ones."""
 
-MASKS = 1024
+COMBINATIONS = 1024
 """Combinations of used sets, and of fused neighbours, for which it is remembered where things stand."""
 
 Statistics = Callable[[], Iterator[tuple[StepModel, PriorMoments]]]
@@ -95,7 +96,7 @@ class Neighbourhood:
         """For each row that is not exact at the head: the last state at which it was."""
         self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
         self._masks: dict[tuple[UsedSet | None, ...], Used] = {}
-        self._where: dict[tuple[NodeId, ...], Ints] = {}
+        self._joints: dict[tuple[NodeId, ...], Ints] = {}
 
     def follow(self, step: int, ledger: Ledger) -> None:
         """Bring the states up to `step` with all that the ledger knows, or nearer to it after a long gap."""
@@ -124,16 +125,14 @@ class Neighbourhood:
             return None
         return history.first_unknown(base.step + 1, step)
 
-    def blocks(self, others: Collection[NodeId]) -> tuple[Array, Array, Array]:
-        """P^(ii) (nx, nx), P^(ij) (d, nx, nx) and P^(jl) (d, d, nx, nx) for the sorted `others`, at the newest step."""
-        chosen = (self._node, *others)
-        where = self._where.get(chosen)
-        if where is None:
-            if len(self._where) == MASKS:
-                self._where.clear()
-            where = self._where[chosen] = self._layout.among(chosen, len(self._initial.mean))
-        P = self._head.state.P.flat.take(where)
-        return P[0, 0], P[0, 1:], P[1:, 1:]
+    def joint(self, others: tuple[NodeId, ...]) -> Array:
+        """The covariances at the newest step that `fusion_weights` needs to fuse the sorted `others`."""
+        index = self._joints.get(others)
+        if index is None:
+            if len(self._joints) == COMBINATIONS:
+                self._joints.clear()
+            index = self._joints[others] = joint_index(self._layout, (self._node, *others), len(self._initial.mean))
+        return self._head.state.P.flat.take(index)
 
     def moments(self, step: int) -> PriorMoments:
         """Mean and covariance of the state at `step`, before any measurement."""
@@ -173,7 +172,7 @@ class Neighbourhood:
     def _mask(self, used: tuple[UsedSet | None, ...]) -> Used:
         mask = self._masks.get(used)
         if mask is None:
-            if len(self._masks) == MASKS:
+            if len(self._masks) == COMBINATIONS:
                 self._masks.clear()
             mask = self._layout.used({node: of or () for node, of in zip(self._nodes, used, strict=True)})
             self._masks[used] = mask

@@ -14,12 +14,19 @@ from itertools import combinations
 import numpy as np
 
 from zfusion.methods.covariances import State, advance, prior
-from zfusion.methods.fusion import fusion_weights
+from zfusion.methods.fusion import fusion_weights, joint_index
 from zfusion.methods.layout import Ints, Layout
 from zfusion.model.network import Network
 from zfusion.model.statistics import StepModel, prior_moments, step_models
 from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
+
+
+RECYCLED_BYTES = (32 << 20) - (64 << 10)
+"""Largest memory block, of those that glibc's malloc keeps when they are freed, once one of this size has been freed.
+
+Smaller ones it would give back to the system at every step, and fetch again page by page: that takes as long as all
+the arithmetic of a network of 64 nodes."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,7 @@ class Filters:
         neighbourhoods: Mapping[NodeId, tuple[NodeId, ...]],
         pairs: Iterable[tuple[NodeId, NodeId]] = (),
     ) -> None:
+        np.empty(RECYCLED_BYTES, dtype=np.uint8)  # and free it
         self.layout = Layout.build(neighbourhoods, {sensor.id: sensor.ny for sensor in system.sensors}, pairs)
         self.state = prior(self.layout, system.initial_covariance)
         self._used = self.layout.used(neighbourhoods)
@@ -93,7 +101,7 @@ class Fusions:
         by_degree: dict[int, list[tuple[int, Ints]]] = defaultdict(list)
         for position, i in enumerate(layout.nodes):
             others = [j for j in network.neighbours(i) if j != i]
-            by_degree[len(others)].append((position, layout.among([i, *others], nx)))
+            by_degree[len(others)].append((position, joint_index(layout, [i, *others], nx)))
         self._shape = (len(layout.nodes), nx, nx)
         self._groups = [
             ([position for position, _ in rows], np.array([where for _, where in rows])) for rows in by_degree.values()
@@ -108,8 +116,7 @@ class Fusions:
         fused = np.empty(self._shape)
         flat = state.P.flat
         for positions, where in self._groups:
-            P = flat.take(where)
-            fused[positions] = fusion_weights(P[:, 0, 0], P[:, 0, 1:], P[:, 1:, 1:], prior_covariance)[1]
+            fused[positions] = fusion_weights(flat.take(where), prior_covariance)[1]
         self._latest = state, prior_covariance, fused
         return fused
 

@@ -130,8 +130,7 @@ class TwoStage(Centralized):
         prior = self._neighbours.moments(step)
         kept = self._weights
         if kept is None or not kept.serve(self._neighbours.state, fused, prior):
-            own, cross, among = self._neighbours.blocks(fused)
-            weights, covariance = fusion_weights(own, cross, among, prior.covariance)
+            weights, covariance = fusion_weights(self._neighbours.joint(fused), prior.covariance)
             kept = self._weights = _Weights(self._neighbours.state, fused, prior, weights, covariance)
         return fuse(self._filter.x, estimates, prior.mean, kept.weights), kept.covariance
 

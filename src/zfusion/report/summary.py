@@ -60,17 +60,16 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    rounds_per_s, latency_us {p50, p99} from measurement to estimate, rmse {stage: {node}} where the truth is known,
-    predicted_rmse {stage: {node}}, recording; and the verdict on each edge.
+    rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps;
+    rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}}, recording; and the verdict on each
+    edge.
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
     for report in lives:
         sent.update(report.sent)
     edges = list(_edges(reports, recorder, to_the_end=not interrupted))
-    latencies = Latencies()
-    for report in lives:
-        latencies.merge({int(number): count for number, count in report.latency.items()})
+    settled = [report.settled for report in lives if report.settled]
     return {
         "run": run,
         "method": scenario.method.name,
@@ -85,8 +84,12 @@ def summarize(
         "fallbacks": sum(report.fallbacks for report in lives),
         "skipped": sum(report.skipped for report in lives),
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
-        "rounds_per_s": _rate(lives),
-        "latency_us": {"p50": latencies.quantile_us(0.5), "p99": latencies.quantile_us(0.99)},
+        "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
+        "latency_us": _quantiles(report.latency for report in lives),
+        "settled": {
+            "rounds_per_s": _rate((pace["completed"], pace["elapsed_s"]) for pace in settled),
+            "latency_us": _quantiles(pace["latency"] for pace in settled),
+        },
         "rmse": _by_stage(reports, "mse"),
         "predicted_rmse": _by_stage(reports, "predicted_mse"),
         "nees": _nees(reports),
@@ -152,10 +155,17 @@ def _refused(lives: Iterable[NodeReport]) -> dict[str, int]:
     return dict(total)
 
 
-def _rate(lives: Sequence[NodeReport]) -> float | None:
-    """Steps a second of the slowest node that took any."""
-    rates = [report.completed / report.elapsed_s for report in lives if report.completed and report.elapsed_s > 0]
+def _rate(paces: Iterable[tuple[int, float]]) -> float | None:
+    """Steps a second of the slowest node, from the steps and the seconds of those that took any."""
+    rates = [completed / elapsed_s for completed, elapsed_s in paces if completed and elapsed_s > 0]
     return round(min(rates), 2) if rates else None
+
+
+def _quantiles(latencies: Iterable[Mapping[str, int]]) -> dict[str, float | None]:
+    merged = Latencies()
+    for counts in latencies:
+        merged.merge({int(number): count for number, count in counts.items()})
+    return {"p50": merged.quantile_us(0.5), "p99": merged.quantile_us(0.99)}
 
 
 def _by_stage(reports: Mapping[NodeId, Sequence[NodeReport]], squared: str) -> dict[str, dict[str, float]]:
