@@ -36,6 +36,9 @@ SIZES = (57, 81)
 
 COUNTER = struct.Struct("<Q")
 
+IN_STEP = 20
+"""Rounds after which all processes are in step, and are paced from there."""
+
 
 def heard(node: int, nodes: int) -> list[int]:
     """Whom a node hears; the example's rows are (1, 2), (2, 3), (0, 3), (0, 1)."""
@@ -86,11 +89,13 @@ def run_node(node: int, run: str, endpoints: list[str], options: argparse.Namesp
         gc.disable()
         period = 0 if options.rate is None else round(1e9 / options.rate)
         durations = []
-        due = begun = time.perf_counter_ns()
+        due = begun = cpu = 0
         for k in range(options.rounds):
             if k == options.rounds // 2:
                 begun, cpu = time.perf_counter_ns(), time.process_time_ns()
-            if period:
+            if period and k < IN_STEP:
+                due = time.perf_counter_ns()
+            elif period:
                 due += period
                 time.sleep(max(0, due - time.perf_counter_ns()) / 1e9)
             start = time.perf_counter_ns()

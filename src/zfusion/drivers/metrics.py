@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -67,6 +68,7 @@ class Pace:
     def __init__(self, begun_ns: int) -> None:
         self.begun_ns = self.ended_ns = begun_ns
         """`ended_ns`: when the last step was completed."""
+        self._cpu_ns = time.process_time_ns()
         self.completed = 0
         self.latencies = Latencies()
 
@@ -82,8 +84,10 @@ class Pace:
         self.latencies.add(latency_ns)
 
     def told(self) -> dict[str, Any]:
-        """As plain data: completed, elapsed_s, latency as `Latencies.told`."""
-        return {"completed": self.completed, "elapsed_s": self.elapsed_s, "latency": self.latencies.told()}
+        """As plain data: completed, elapsed_s, latency as `Latencies.told`; cpu_s, of this process, until now."""
+        cpu_s = (time.process_time_ns() - self._cpu_ns) / 1e9
+        told = {"completed": self.completed, "elapsed_s": self.elapsed_s, "cpu_s": cpu_s}
+        return {**told, "latency": self.latencies.told()}
 
 
 ERROR_BLOCK = 256
@@ -158,7 +162,7 @@ class NodeReport:
     estimate: dict[str, list[float]] = field(default_factory=dict)
     """The last one: `x`, and `sd`, the standard deviations that its P gives."""
     settled: dict[str, Any] = field(default_factory=dict)
-    """completed, elapsed_s and latency of the part of its life that counts as settled, where there is one."""
+    """`Pace.told` of the part of its life that counts as settled, where there is one."""
 
     @classmethod
     def of_nothing(cls, node: NodeId) -> NodeReport:

@@ -47,7 +47,8 @@ def joint_index(layout: Layout, nodes: Sequence[NodeId], nx: int) -> Ints:
     index = where[order[:, None], order]
     each = where[np.arange(c), np.arange(c)][order]
     index[1, :], index[:, 1] = each, each
-    return index.swapaxes(1, 2).reshape((1 + c) * nx, (1 + c) * nx)
+    joint: Ints = index.swapaxes(1, 2).reshape((1 + c) * nx, (1 + c) * nx)
+    return joint
 
 
 def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
@@ -64,6 +65,7 @@ def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
     """
     nx = len(prior)
     known = np.isfinite(prior).all()
+    joint = joint.copy()
     joint[..., nx : 2 * nx, nx : 2 * nx] = prior if known else 0.0
     difference = _differences(joint.shape[-1] // nx - 1, nx)
     own = joint[..., :nx, :nx]
@@ -92,7 +94,8 @@ def fuse(own: Array, others: Sequence[Array], mean: Array, weights: Array) -> Ar
 @cache
 def _differences(count: int, nx: int) -> Array:
     """(e^i - e^0; e^i - e^1; ...) in terms of (e^i; e^0; e^1; ...), (count nx, (1 + count) nx)."""
-    return np.kron(np.hstack((np.ones((count, 1)), -np.eye(count))), np.eye(nx))
+    matrix: Array = np.kron(np.hstack((np.ones((count, 1)), -np.eye(count))), np.eye(nx)).astype(np.float64)
+    return matrix
 
 
 def _solve(unit: Array, c: Array) -> Array:
@@ -103,10 +106,9 @@ def _solve(unit: Array, c: Array) -> Array:
     except np.linalg.LinAlgError:
         regular = False
     if regular:
-        solution: Array = np.linalg.solve(unit, c.swapaxes(-1, -2))
-        return solution.swapaxes(-1, -2)
+        return np.asarray(np.linalg.solve(unit, c.swapaxes(-1, -2)), dtype=np.float64).swapaxes(-1, -2)
     values, vectors = np.linalg.eigh(unit)
     kept = values > SMALLEST_EIGENVALUE
-    inverse = kept / np.where(kept, values, 1.0)
-    projected: Array = (c @ vectors) * inverse[..., None, :]
-    return projected @ vectors.swapaxes(-1, -2)
+    projected: Array = (c @ vectors) * (kept / np.where(kept, values, 1.0))[..., None, :]
+    truncated: Array = projected @ vectors.swapaxes(-1, -2)
+    return truncated

@@ -95,6 +95,7 @@ class Neighbourhood:
         self._aside: dict[int, Tracked] = {}
         """For each row that is not exact at the head: the last state at which it was."""
         self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
+        self._named: tuple[tuple[bool, ...], frozenset[NodeId]] = (start.exact, frozenset(self._nodes))
         self._masks: dict[tuple[UsedSet | None, ...], Used] = {}
         self._joints: dict[tuple[NodeId, ...], Ints] = {}
 
@@ -115,7 +116,10 @@ class Neighbourhood:
         head = self._head
         if head.step != step:
             return frozenset()
-        return frozenset([node for node, known in zip(self._nodes, head.exact, strict=True) if known])
+        if head.exact is not self._named[0]:
+            names = frozenset(node for node, known in zip(self._nodes, head.exact, strict=True) if known)
+            self._named = head.exact, names
+        return self._named[1]
 
     def missing(self, node: NodeId, step: int, ledger: Ledger) -> int | None:
         """The first step up to `step` whose used set of `node` is needed and not known; None where all is known."""

@@ -21,7 +21,6 @@ from zfusion.model.statistics import StepModel, prior_moments, step_models
 from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 
-
 RECYCLED_BYTES = (32 << 20) - (64 << 10)
 """Largest memory block, of those that glibc's malloc keeps when they are freed, once one of this size has been freed.
 

@@ -114,17 +114,19 @@ class TwoStage(Centralized):
             return {"x": self._filter.x, "used": used}
         self._neighbours.follow(step, ledger)
         known = self._neighbours.exact(step)
-        others = tuple([j for j in self._others if j in arrived])
-        fused = tuple([j for j in others if j in known])
-        x, P = self._fuse(step, fused, [cast(Array, arrived[j]["x"]) for j in fused])
-        if len(fused) == len(self._others):
+        others = self._others
+        if len(arrived) == len(self._neighbourhood) and known.issuperset(others):
+            x, P = self._fuse(step, others, arrived)
             return Outcome(x, P, self._neighbourhood)
-        used = tuple([j for j in self._neighbourhood if j == self._node or j in fused])
-        excluded = tuple([j for j in others if j not in known])
+        others = tuple(j for j in others if j in arrived)
+        fused = tuple(j for j in others if j in known)
+        excluded = tuple(j for j in others if j not in known)
+        x, P = self._fuse(step, fused, arrived)
+        used = tuple(j for j in self._neighbourhood if j == self._node or j in fused)
         ask = {j: first for j in excluded if (first := self._neighbours.missing(j, step, ledger)) is not None}
         return Outcome(x, P, used, excluded, ask)
 
-    def _fuse(self, step: int, fused: UsedSet, estimates: list[Array]) -> tuple[Array, Array]:
+    def _fuse(self, step: int, fused: UsedSet, arrived: Mapping[NodeId, Fields]) -> tuple[Array, Array]:
         if not fused:
             return self._filter.x, self._filter.P
         prior = self._neighbours.moments(step)
@@ -132,6 +134,7 @@ class TwoStage(Centralized):
         if kept is None or not kept.serve(self._neighbours.state, fused, prior):
             weights, covariance = fusion_weights(self._neighbours.joint(fused), prior.covariance)
             kept = self._weights = _Weights(self._neighbours.state, fused, prior, weights, covariance)
+        estimates = [cast(Array, arrived[j]["x"]) for j in fused]
         return fuse(self._filter.x, estimates, prior.mean, kept.weights), kept.covariance
 
 

@@ -60,8 +60,8 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps;
-    rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}}, recording; and the verdict on each
+    rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps, and
+    cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}}, recording; and the verdict on each
     edge.
     """
     lives = [report for of_node in reports.values() for report in of_node]
@@ -89,6 +89,7 @@ def summarize(
         "settled": {
             "rounds_per_s": _rate((pace["completed"], pace["elapsed_s"]) for pace in settled),
             "latency_us": _quantiles(pace["latency"] for pace in settled),
+            "cpu_us": _cpu(settled),
         },
         "rmse": _by_stage(reports, "mse"),
         "predicted_rmse": _by_stage(reports, "predicted_mse"),
@@ -159,6 +160,12 @@ def _rate(paces: Iterable[tuple[int, float]]) -> float | None:
     """Steps a second of the slowest node, from the steps and the seconds of those that took any."""
     rates = [completed / elapsed_s for completed, elapsed_s in paces if completed and elapsed_s > 0]
     return round(min(rates), 2) if rates else None
+
+
+def _cpu(paces: Sequence[Mapping[str, Any]]) -> float | None:
+    """Microseconds of CPU of a node's process for a step."""
+    steps = sum(pace["completed"] for pace in paces)
+    return round(1e6 * sum(pace["cpu_s"] for pace in paces) / steps, 1) if steps else None
 
 
 def _quantiles(latencies: Iterable[Mapping[str, int]]) -> dict[str, float | None]:
