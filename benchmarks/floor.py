@@ -3,8 +3,8 @@
     python benchmarks/floor.py [--rounds N] [--rate HZ] [--lowlatency] [--nodes N] [--json]
 
 Each process puts a message of a measurement's size, waits for one of each of the two that it hears, puts one of an
-intermediate estimate's size, waits again. No codec but a counter, no numerics, no time stamps, no accounts; one thread for
-Zenoh, a channel for each neighbour, links between neighbours only, every message at once: the leanest of what was
+intermediate estimate's size, waits again. No codec but a counter, no numerics, no time stamps, no accounts; one thread
+for Zenoh, a channel for each neighbour, links between neighbours only, every message at once: the leanest of what was
 tried. (The estimate itself is heard by nobody here, so it is not sent.) The graph is that of the four-sensor example
 for four nodes: node i hears i + 1 and i + 2.
 """

@@ -176,11 +176,20 @@ def test_nodes_of_very_different_sizes_are_padded_in_classes(monkeypatch: pytest
         assert identical(several.layout.flip(several.state.P), several.state.P)
 
 
-def test_a_hub_with_hundreds_of_leaves_is_not_padded_to_the_fourth_power() -> None:
-    ids: list[NodeId] = list(range(301))
-    neighbours: Neighbours = {0: tuple(ids), **{i: (0, i) for i in ids[1:]}}
-    tracked = Layout.build(neighbours, dict.fromkeys(ids, 1))
-    assert prior(tracked, np.eye(2)).Pi.nbytes < 10_000_000
+@pytest.mark.parametrize("changed", StepModel._fields)
+def test_what_changes_in_a_model_is_noticed_whatever_stays_the_same(changed: str) -> None:
+    """The statistics are picked anew only where they are other objects than in the step before."""
+    rng = np.random.default_rng(14)
+    system = random_systems.random_system(rng, ids=NAMES, nx=2)
+    recursion = Recursion(system, dict.fromkeys(NAMES, NAMES))
+    for _ in range(3):
+        state = recursion.step(dict.fromkeys(NAMES, NAMES))
+    assert recursion.model is not None
+    model = recursion.model._replace(**{changed: 1.1 * getattr(recursion.model, changed)})
+    found = advance(recursion.layout, state, model, state.used)
+    wanted = advance(recursion.layout, state, StepModel(*map(np.copy, model)), state.used)
+    assert identical(found.P, wanted.P)
+    assert not identical(found.P, advance(recursion.layout, state, recursion.model, state.used).P)
 
 
 def test_a_node_that_forgets_is_one_that_has_used_nothing_so_far() -> None:

@@ -9,8 +9,8 @@ import msgpack
 import numpy as np
 import pytest
 import zenoh
-from swarms import wait_until
 
+from swarms import wait_until
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.key_source import KeySource
 from zfusion.drivers.transport import open_session

@@ -7,6 +7,8 @@
     │   └── RecordingError   a recording that is missing, damaged or of another version
     ├── RunError             what was started failed                                     (exit code 1)
     └── MessageError         bytes from a peer that are not a legal message              (counted, never fatal)
+
+The command line exits with an error's `exit_code`.
 """
 
 from __future__ import annotations

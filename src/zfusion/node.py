@@ -182,7 +182,8 @@ class Node:
             counters.refused[refusal] += 1
             return []
         counters.gaps[message.stage].observe(message.born, message.seq)
-        late = step < self.step or (step == self.step and stage < self._passed)
+        present = self._stage if self._stage >= 0 else len(self._stages)
+        late = step < self.step or (step == self.step and stage < present)
         self._note_presence(message, late)
         effects: list[Effect] = []
         if late:
@@ -221,11 +222,6 @@ class Node:
         """A message on the node's event key."""
         return self._message(EVENT.name, {"kind": kind, "data": details}, now)
 
-    @property
-    def _passed(self) -> int:
-        """How many stages of the present step are over."""
-        return self._stage if self._stage >= 0 else len(self._stages)
-
     def _refusal(self, message: Message, stage: int) -> str | None:
         """Why a message is not taken in, not even as late; None where it is new and of the sender's present life.
 
@@ -251,9 +247,9 @@ class Node:
         return None
 
     def _forget_former_life(self, j: NodeId, born: int) -> None:
-        """What it had said in advance does not count any more: it says it again."""
-        for messages in self._early.values():
-            if messages.pop(j, None) is not None:
+        """What it had said in advance of steps of the new life does not count any more: it says it again."""
+        for at, messages in self._early.items():
+            if at[0] >= born and messages.pop(j, None) is not None:
                 self.counters[j].refused["former_life"] += 1
         for step, seen in self._seen.items():
             if step >= born:

@@ -340,7 +340,7 @@ class LiveNode:
         for j in node.silent:
             self._inbox.drain([channel for channel in self._decoders if channel[0] == j], self._take)
         while (stage := node.stage) is not None and not self._stopping:
-            self._await_message(node, (node.awaiting[0], stage))
+            self._await_messages(node, stage)
         if node.stage is None:
             latency = time.perf_counter_ns() - began
             now = time.time_ns()
@@ -351,11 +351,20 @@ class LiveNode:
             account.compare(estimate)
         self._estimates.clear()
 
-    def _await_message(self, node: Node, channel: Channel) -> None:
-        """Wait for one message, the deadline or a notice, and act on it."""
-        data = self._inbox.wait(channel, node.deadline)
-        if data is not None:
+    def _await_messages(self, node: Node, stage: str) -> None:
+        """Wait for the messages of a stage, the deadline or a notice, and act on it.
+
+        The messages are taken together when the last is there: to wait and to work in turns costs more than both.
+        """
+        awaiting, came = node.awaiting, []
+        for j in awaiting:
+            data = self._inbox.wait((j, stage), node.deadline)
+            if data is None:
+                break
+            came.append(((j, stage), data))
+        for channel, data in came:
             self._take(channel, data)
+        if len(came) == len(awaiting):
             return
         self._handle_notices()
         overdue = node.deadline is not None and time.time_ns() >= node.deadline

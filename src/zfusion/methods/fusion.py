@@ -27,13 +27,16 @@ TWIN = 1e-13
 Two neighbours that used the same measurements have the same estimate; its difference carries no weight."""
 
 SMALLEST_EIGENVALUE = 1e-10
-"""Eigenvalues of Z, scaled to a unit diagonal, below this are zero: those differences determine each other.
+"""Eigenvalues of Z, scaled to a unit diagonal, below this are zero: those differences determine each other."""
 
-The estimates of nodes that lost a few of each other's messages converge, and their differences become so small that
-Z is mostly rounding: with 1e-12 that costs up to 1e-5 of Σ, with 1e-10 less than 1e-7, all that it can lose."""
+ROUNDING = 1e-14
+"""Rounding in Z, in parts of P^(ii), with a margin: an eigenvalue that does not stand out of it is zero.
+
+The estimates of nodes that lost a few of each other's messages converge. On their way through 1e-6 of a standard
+deviation their differences, scaled up, are mostly rounding, and weights made of that would be anything."""
 
 REGULAR_PIVOT = 1e-7
-"""With all pivots above this, Z has no eigenvalue that would be taken as zero: it is solved as it is."""
+"""With all pivots above this, and above rounding, no eigenvalue is taken as zero: Z is solved as it is."""
 
 
 def joint_index(layout: Layout, nodes: Sequence[NodeId], nx: int) -> Ints:
@@ -64,9 +67,8 @@ def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
         (weights, Σ): (..., nx, (1 + d) nx), the prior's columns first, and (..., nx, nx).
     """
     nx = len(prior)
-    known = np.isfinite(prior).all()
     joint = joint.copy()
-    joint[..., nx : 2 * nx, nx : 2 * nx] = prior if known else 0.0
+    joint[..., nx : 2 * nx, nx : 2 * nx] = prior if np.isfinite(prior).all() else 0.0  # then Z_00 is below any TWIN
     difference = _differences(joint.shape[-1] // nx - 1, nx)
     own = joint[..., :nx, :nx]
     c = joint[..., :nx, :] @ difference.T
@@ -74,12 +76,11 @@ def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
     reference = np.concatenate((own.diagonal(0, -2, -1),) * (Z.shape[-1] // nx), axis=-1)
     variance = Z.diagonal(0, -2, -1)
     alive = variance > np.maximum(TWIN * reference, SMALLEST_VARIANCE)
-    if not known:
-        alive[..., :nx] = False
     scale = alive / np.sqrt(np.where(alive, variance, 1.0))
     unit = Z * (scale[..., :, None] * scale[..., None, :])
     np.einsum("...aa->...a", unit)[...] = 1.0
-    weights = _solve(unit, c * scale[..., None, :]) * scale[..., None, :]
+    rounding = np.sqrt(ROUNDING * np.maximum(reference, 0.0)) * scale
+    weights = _solve(unit, c * scale[..., None, :], rounding) * scale[..., None, :]
     gained = weights @ c.swapaxes(-1, -2)
     return weights, own - 0.5 * (gained + gained.swapaxes(-1, -2))
 
@@ -98,17 +99,21 @@ def _differences(count: int, nx: int) -> Array:
     return matrix
 
 
-def _solve(unit: Array, c: Array) -> Array:
-    """c Z⁺ for covariance matrices Z with unit diagonals, (..., n, n), and c (..., nx, n)."""
+def _solve(unit: Array, c: Array, rounding: Array) -> Array:
+    """c Z⁺ for covariance matrices Z with unit diagonals, (..., n, n), and c (..., nx, n).
+
+    `rounding` are the standard deviations, (..., n), of the rounding in each of the rows.
+    """
     try:
         pivots = np.linalg.cholesky(unit).diagonal(0, -2, -1)
-        regular = pivots.min(initial=1.0) ** 2 > REGULAR_PIVOT
+        regular = (pivots.min(-1) ** 2 > np.maximum(REGULAR_PIVOT, rounding.sum(-1) ** 2)).all()
     except np.linalg.LinAlgError:
         regular = False
     if regular:
         return np.asarray(np.linalg.solve(unit, c.swapaxes(-1, -2)), dtype=np.float64).swapaxes(-1, -2)
     values, vectors = np.linalg.eigh(unit)
-    kept = values > SMALLEST_EIGENVALUE
+    noise = (rounding[..., None, :] @ np.abs(vectors))[..., 0, :] ** 2
+    kept = values > np.maximum(SMALLEST_EIGENVALUE, noise)
     projected: Array = (c @ vectors) * (kept / np.where(kept, values, 1.0))[..., None, :]
     truncated: Array = projected @ vectors.swapaxes(-1, -2)
     return truncated

@@ -60,9 +60,9 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps, and
-    cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}}, recording; and the verdict on each
-    edge.
+    rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
+    and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
+    recording; and the verdict on each edge.
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
