@@ -343,6 +343,12 @@ def test_a_time_invariant_network_settles_and_then_costs_nothing(
     assert not work
     recursion.step({**neighbours, system.ids[0]: ()})
     assert len(work) == 1
+    nothing: Neighbours = {}
+    steps_until_settled(recursion, nothing, 1000)
+    recursion.state = forget(recursion.layout, recursion.state, system.ids, recursion.moments.covariance)
+    work.clear()
+    recursion.step(nothing)
+    assert len(work) == 1
     assert steps_until_settled(recursion, neighbours, 1000) > 2
     np.testing.assert_allclose(recursion.state.P.flat, settled.P.flat, rtol=1e-11, atol=1e-13)
 

@@ -126,6 +126,44 @@ def test_what_is_called_exact_is_and_all_is_that_can_be(
             told.check(k)
 
 
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(events, st.integers(0, 1000))
+def test_what_is_called_exact_is_so_while_catching_up_too(
+    story: list[tuple[set[NodeId], set[NodeId], set[NodeId]]], seed: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(neighbourhood, "WINDOW", 2)
+        patch.setattr(neighbourhood, "CATCH_UP", 2 * neighbourhood.UNSETTLED)
+        told = Story(seed)
+        for k, (heard, reborn, asked) in enumerate(story, start=1):
+            told.step(k, heard, reborn - {0}, asked - {0})
+            known = told.tracked.exact(k)
+            if known:
+                assert_exact(told.tracked, known, fresh(told.system, {i: told.true[i] for i in known}, k))
+        end = 2 * len(story) + 5
+        for k in range(len(story) + 1, end):
+            told.step(k, set(OTHERS), set(), set(OTHERS))
+        assert told.check(end - 1) == len(OTHERS)
+
+
+def test_a_new_life_that_began_while_the_former_one_still_spoke() -> None:
+    """What had seemed exact is not, until the gap in the new life's history is filled."""
+    story = Story(11)
+    for k in range(1, 11):
+        story.step(k, set(OTHERS), set(), set())
+    new = History(9)
+    for k, used in ((9, (2,)), (10, (3,)), (11, ()), (12, (2, 3))):
+        new.learn(k, used)
+    story.ledger.learn(3, 9, 12, (2, 3), [(11, ())])
+    story.tracked.follow(10, story.ledger)
+    assert story.tracked.exact(10) == {1, 2, 4}
+    story.true[3] = new
+    assert story.tracked.missing(3, 10, story.ledger) == 9
+    story.ledger.fill(3, 9, 10, new.runs(10))
+    story.tracked.follow(10, story.ledger)
+    assert story.check(10) == 3
+
+
 def test_neighbours_lost_and_recovered_in_any_order() -> None:
     """Gaps longer than the window, one inside the other, filled from the inside and from the outside."""
     for order in ((1, 3, 4), (4, 3, 1), (3, 1, 4)):
@@ -181,6 +219,19 @@ def test_whoever_contradicts_itself_beyond_the_window_is_not_trusted_any_more(mo
     assert_exact(story.tracked, frozenset({1, 2, 4}), fresh(story.system, story.true, 20))
     story.step(21, set(OTHERS), {3}, set())
     assert story.check(21) == 3  # a new life is believed
+
+
+def test_whoever_contradicts_what_it_said_before_its_gap_is_not_followed_from_there() -> None:
+    story = Story(12)
+    for k in range(1, 100):
+        story.step(k, set(OTHERS) if k < 20 else {1, 4}, set(), set())
+    lie = (5,) if story.true[3].at(10) != (5,) else ()
+    story.ledger.fill(3, 1, 10, [(10, lie)])
+    story.step(100, set(OTHERS), set(), {3})
+    assert story.tracked.exact(100) == {1, 2, 4}
+    assert story.tracked.missing(3, 100, story.ledger) is None  # nothing that it could say would help
+    story.step(101, set(OTHERS), {3}, set())
+    assert story.check(101) == 3
 
 
 def test_the_state_is_the_same_object_once_all_has_settled() -> None:

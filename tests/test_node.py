@@ -582,6 +582,13 @@ def test_a_neighbour_that_is_back_is_waited_for_from_when_it_can_be_in_time() ->
     other.receive(message(2, 1), now=0)  # late: it is in time from the next step on
     other.begin(3, y1(), now=0)
     assert other.awaiting == (2,)
+    third = make(1, expected=(3,))
+    third.back(2)
+    complete_step(third, 1, (3,))
+    third.begin(2, y1(), now=0)
+    third.receive(message(2, 1), now=0)
+    third.receive(message(3, 2), now=0)
+    assert (third.stage, third.awaiting) == ("intermediate", (3,))
 
 
 def test_nobody_begins_a_new_life_without_having_been_gone() -> None:
@@ -598,6 +605,8 @@ def test_nobody_begins_a_new_life_without_having_been_gone() -> None:
     assert node.counters[2].received["measurement"] == 2
     node.receive(message(2, 2, "intermediate"), now=0)
     assert node.counters[2].refused["former_life"] == 2
+    node.receive(message(2, 3, born=3), now=0)
+    assert node.counters[2].refused["unannounced_life"] == 2
 
 
 def test_the_last_words_of_a_former_life_are_not_taken_for_the_new_ones() -> None:
@@ -625,6 +634,23 @@ def test_the_last_words_of_a_former_life_are_not_taken_for_the_new_ones() -> Non
     assert node.estimate.used == (1, 2, 3)
 
 
+def test_what_a_former_life_had_said_of_its_own_steps_still_counts() -> None:
+    node = make(1)
+    for k in (1, 2):
+        for stage in ("measurement", "intermediate"):
+            node.receive(message(2, k, stage), now=0)
+    node.gone(2, now=0)
+    node.back(2)
+    node.receive(message(2, 3, born=3), now=0)
+    for k in (1, 2):
+        complete_step(node, k, (3,))
+        assert node.estimate is not None
+        assert node.estimate.used == (1, 2, 3)
+    assert not node.counters[2].refused
+    node.begin(3, y1(), now=0)
+    assert node.awaiting == (3,)
+
+
 def test_nothing_was_used_in_steps_that_were_slept_through() -> None:
     node = make(1, expected=())
     node.begin(1, y1(), now=0)
@@ -635,6 +661,8 @@ def test_nothing_was_used_in_steps_that_were_slept_through() -> None:
     assert node.completed == 2
     (_, said, _) = told(node.begin(6, y1(), now=0))
     assert said.fields["history"] == ((1, (1,)), (2, ()), (5, (1,)))
+    node.begin(1000, y1(), now=0)
+    assert not node._seen
 
 
 def test_a_step_begins_once_and_after_the_last_has_ended() -> None:

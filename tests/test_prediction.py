@@ -69,6 +69,25 @@ def test_networks_of_every_shape(network: Any) -> None:
         np.testing.assert_allclose(getattr(predicted, estimate), getattr(wanted, estimate), rtol=1e-8, atol=1e-10)
 
 
+def test_a_prior_that_stays_the_same() -> None:
+    system = tracking.random_walk({1: 1.0, 2: 1.5, 3: 0.7}, F=0.5, Q=0.75, P0=1.0)
+    neighbours: dict[NodeId, tuple[NodeId, ...]] = {1: (1, 2, 3), 2: (1, 2), 3: (2, 3)}
+    predicted = predict(system, Network(neighbours, {}), STEPS)
+    wanted = brute_force.error_covariances(system, neighbours, STEPS)
+    np.testing.assert_allclose(predicted.distributed, wanted.distributed, rtol=1e-11)
+
+
+def test_twins_that_know_a_million_times_less() -> None:
+    """Nodes 2 and 3 are twins, and the rounding in their variances is as large as node 1's own variance."""
+    system = tracking.random_walk({1: 1e6, 2: 1.0, 3: 0.7, 4: 1.0}, F=0.5, Q=0.75, P0=1.0)
+    neighbours: dict[NodeId, tuple[NodeId, ...]] = {1: (1, 2, 3), 2: (2, 3, 4), 3: (2, 3, 4), 4: (4,)}
+    predicted = predict(system, Network(neighbours, {}), STEPS)
+    wanted = brute_force.error_covariances(system, neighbours, STEPS)
+    assert wanted.distributed[-1, 0] < 2e-12
+    np.testing.assert_allclose(predicted.distributed[:, 0], wanted.distributed[:, 0], rtol=1e-3)
+    np.testing.assert_allclose(predicted.distributed[:, 1:], wanted.distributed[:, 1:], rtol=1e-10)
+
+
 def test_hundreds_of_nodes() -> None:
     """Nothing of the size of all pairs of nodes: a few hundred megabytes would show it."""
     ids: list[NodeId] = list(range(300))

@@ -53,3 +53,21 @@ def target(
             },
         ),
     )
+
+
+def random_walk(sensors: dict[NodeId, float], *, F: float, Q: float, P0: float) -> System:
+    """A scalar state that is forgotten by the factor F, with private noises; larger numbers see it more precisely."""
+    one = np.eye(1)
+    white = {"push": WhiteNoise(Q * one)} | {f"sensor {i}": WhiteNoise(one / w**2) for i, w in sensors.items()}
+    return System(
+        nx=1,
+        initial_mean=np.zeros(1),
+        initial_covariance=P0 * one,
+        F=Schedule((Fixed(F * one),)),
+        sensors=tuple(Sensor(i, 1, Schedule((Fixed(one),), first=1)) for i in sensors),
+        noise=MovingAverageNoise(
+            white=white,
+            process=(Tap("push", 0, Schedule((one,))),),
+            sensors={i: (Tap(f"sensor {i}", 0, Schedule((one,))),) for i in sensors},
+        ),
+    )

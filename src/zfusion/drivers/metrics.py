@@ -149,7 +149,7 @@ class NodeReport:
     completed: int
     skipped: int
     elapsed_s: float
-    """From the start of its first step to the end of its last."""
+    """From the start of its first step to the end of its last; a paced step lasts its period, if not longer."""
     sent: dict[str, int]
     edges: dict[str, dict[str, dict[str, int]]]
     """Neighbour -> received, late, missed, refused -> by stage or reason."""

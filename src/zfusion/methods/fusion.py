@@ -26,17 +26,15 @@ TWIN = 1e-13
 
 Two neighbours that used the same measurements have the same estimate; its difference carries no weight."""
 
-SMALLEST_EIGENVALUE = 1e-10
-"""Eigenvalues of Z, scaled to a unit diagonal, below this are zero: those differences determine each other."""
-
 ROUNDING = 1e-14
-"""Rounding in Z, in parts of P^(ii), with a margin: an eigenvalue that does not stand out of it is zero.
+"""Rounding in Z, in parts of P^(ii) or of itself, with a margin: an eigenvalue that does not stand out of it is zero.
 
-The estimates of nodes that lost a few of each other's messages converge. On their way through 1e-6 of a standard
-deviation their differences, scaled up, are mostly rounding, and weights made of that would be anything."""
+Differences may determine each other. And the estimates of nodes that lost a few of each other's messages converge:
+on their way through 1e-6 of a standard deviation their differences, scaled up, are mostly rounding, and weights made
+of that would be anything."""
 
-REGULAR_PIVOT = 1e-7
-"""With all pivots above this, and above rounding, no eigenvalue is taken as zero: Z is solved as it is."""
+MARGIN = 300.0
+"""A Z all of whose pivots stand out of the rounding this far has no eigenvalue near it: it is solved as it is."""
 
 
 def joint_index(layout: Layout, nodes: Sequence[NodeId], nx: int) -> Ints:
@@ -79,7 +77,7 @@ def fusion_weights(joint: Array, prior: Array) -> tuple[Array, Array]:
     scale = alive / np.sqrt(np.where(alive, variance, 1.0))
     unit = Z * (scale[..., :, None] * scale[..., None, :])
     np.einsum("...aa->...a", unit)[...] = 1.0
-    rounding = np.sqrt(ROUNDING * np.maximum(reference, 0.0)) * scale
+    rounding = np.sqrt(ROUNDING * np.maximum(reference, variance)) * scale
     weights = _solve(unit, c * scale[..., None, :], rounding) * scale[..., None, :]
     gained = weights @ c.swapaxes(-1, -2)
     return weights, own - 0.5 * (gained + gained.swapaxes(-1, -2))
@@ -106,14 +104,13 @@ def _solve(unit: Array, c: Array, rounding: Array) -> Array:
     """
     try:
         pivots = np.linalg.cholesky(unit).diagonal(0, -2, -1)
-        regular = (pivots.min(-1) ** 2 > np.maximum(REGULAR_PIVOT, rounding.sum(-1) ** 2)).all()
+        regular = (pivots.min(-1) > MARGIN * rounding.sum(-1)).all()
     except np.linalg.LinAlgError:
         regular = False
     if regular:
         return np.asarray(np.linalg.solve(unit, c.swapaxes(-1, -2)), dtype=np.float64).swapaxes(-1, -2)
     values, vectors = np.linalg.eigh(unit)
-    noise = (rounding[..., None, :] @ np.abs(vectors))[..., 0, :] ** 2
-    kept = values > np.maximum(SMALLEST_EIGENVALUE, noise)
+    kept = values > (rounding[..., None, :] @ np.abs(vectors))[..., 0, :] ** 2
     projected: Array = (c @ vectors) * (kept / np.where(kept, values, 1.0))[..., None, :]
     truncated: Array = projected @ vectors.swapaxes(-1, -2)
     return truncated

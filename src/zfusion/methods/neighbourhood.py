@@ -93,7 +93,7 @@ class Neighbourhood:
         self._recent: dict[int, Tracked] = {0: start}
         """The last states up to the head, in ascending order of their steps."""
         self._aside: dict[int, Tracked] = {}
-        """For each row that is not exact at the head: the last state at which it was."""
+        """For each row that is not exact at the head: the last state at which it was, if there is one."""
         self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
         self._named: tuple[tuple[bool, ...], frozenset[NodeId]] = (start.exact, frozenset(self._nodes))
         self._masks: dict[tuple[UsedSet | None, ...], Used] = {}
@@ -162,8 +162,8 @@ class Neighbourhood:
         """The next step after `head`, with the used sets that are known and none where they are not."""
         step = head.step + 1
         histories = [ledger.of(node) for node in self._nodes]
-        used = tuple([None if h is None or step < h.born else h.at(step) for h in histories])
-        begins = [row for row, h in enumerate(histories) if h is not None and h.born == step] if step > 1 else []
+        used = tuple([None if h is None else h.at(step) for h in histories])
+        begins = [row for row, h in enumerate(histories) if h is not None and h.born == step]
         state, exact = head.state, head.exact
         if begins:
             state = forget(
@@ -196,23 +196,24 @@ class Neighbourhood:
         """Go back before `changed`, to the newest state from which this row can be followed up to the head."""
         history = ledger.of(self._nodes[row])
         assert history is not None  # something has changed in it
-        right = (t for t in reversed(self._recent.values()) if t.exact[row] or history.born > t.step)
-        base = next((t for t in right if t.step < changed), self._aside.get(row))
+        kept = [t for t in self._recent.values() if t.exact[row] or history.born > t.step]
+        if row in self._aside:
+            kept.insert(0, self._aside[row])
+        base = next((t for t in reversed(kept) if t.step < changed), None)
         if base is None or history.first_unknown(base.step + 1, self._head.step) is not None:
             self._distrust(row, changed, base)
             return
         self._recent = {step: kept for step, kept in self._recent.items() if step < base.step}
         self._recent[base.step] = self._head = base
-        self._aside = {r: kept for r, kept in self._aside.items() if not base.exact[r] and kept.step < base.step}
 
     def _distrust(self, row: int, changed: int, base: Tracked | None) -> None:
         """The states from `changed` on are not right for this row, whatever they seemed; that of `base` still is."""
-        if not self._head.exact[row]:
-            return
+        if base is None:
+            self._aside.pop(row, None)
+        else:
+            self._aside[row] = base
         for step, kept in self._recent.items():
-            if step >= changed:
-                exact = tuple(known and r != row for r, known in enumerate(kept.exact))
+            if step >= changed and kept.exact[row]:
+                exact = tuple([known and r != row for r, known in enumerate(kept.exact)])
                 self._recent[step] = kept._replace(exact=exact)
         self._head = self._recent[self._head.step]
-        if base is not None:
-            self._aside[row] = base

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -190,6 +191,8 @@ class Launcher:
                 env={**os.environ, **ONE_THREAD},
             )
         line.child.close()
+        if child.node is not None:
+            _let_finish(child.process.pid)
         child.exit_code, child.error, child.status = None, None, {}
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
@@ -315,6 +318,16 @@ def free_endpoints(number: int) -> list[str]:
     finally:
         for s in sockets:
             s.close()
+
+
+def _let_finish(pid: int) -> None:
+    """Have a node not be interrupted by the others whenever they wake up, where there are more nodes than processors.
+
+    (Linux's SCHED_BATCH: a sixth less CPU for a step of the four-sensor example on two processors.)
+    """
+    if sys.platform == "linux":
+        with suppress(OSError):  # it is gone already, or we are not allowed to
+            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _each(option: str, values: Collection[str]) -> list[str]:
