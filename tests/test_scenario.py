@@ -438,7 +438,7 @@ def test_what_matters_to_a_run_is_in_the_fingerprint(changes):
 def test_the_fingerprint_is_the_same_in_every_process():
     """Nodes compare it across machines: a changed value is a changed protocol, and needs another version in it."""
     fingerprint = load_scenario(EXAMPLES / "four_sensor.toml").fingerprint
-    assert fingerprint == "25ebd0c9eea262c2604e9caaaee6062b7f457b76d9e74f3e232ecf14ed0fafdc"
+    assert fingerprint == "a1a349fb3c5cb9acbc4270b1b665854c112c3292491f2cfcfc77af87e38ca1f7"
 
 
 # --- what is wrong is said, where and how ---
@@ -452,7 +452,7 @@ def test_the_fingerprint_is_the_same_in_every_process():
         ("steps", True, "steps", "expected a whole number"),
         ("name", "a b", "name", "expected a name of letters"),
         ("sed", 1, "sed", "unknown key; did you mean 'seed'?"),
-        ("zzz", 1, "zzz", "unknown key; expected one of description, method, name, network"),
+        ("zzz", 1, "zzz", "unknown key; expected one of description, faults, links, method, name"),
         ("sensors.0.h", 1, "sensors[0].h", "unknown key; did you mean 'H'?"),
         ("sensors.1.R", [[1, 0.5], [0.4, 1]], "sensors[1].R", "expected a symmetric matrix"),
         ("sensors.1.R", [[1, 2], [2, 1]], "sensors[1].R", "expected a positive semi-definite matrix"),
@@ -874,7 +874,7 @@ BASE_OF_FRAGMENTS = """
     sensors = [{ count = 3, H = 1, R = 1 }]
 """
 
-REFERENCE = (DOCS / "scenario.md").read_text(encoding="utf-8")
+REFERENCE = "\n".join((DOCS / page).read_text(encoding="utf-8") for page in ("scenario.md", "links.md"))
 
 
 def fragments(language: str) -> list[str]:

@@ -113,7 +113,7 @@ class Network:
     def random_geometric(cls, ids: Iterable[NodeId], radius: float, seed: int) -> Network:
         """Nodes at random in the unit square; those at most `radius` apart hear each other."""
         ids = tuple(sorted_ids(ids))
-        points = np.random.default_rng(seed).random((len(ids), 2))
+        points = points_in_square(len(ids), seed)
         edges = []
         for i, point in enumerate(points):
             near = np.flatnonzero(((points[i + 1 :] - point) ** 2).sum(axis=1) <= radius**2)
@@ -199,6 +199,11 @@ class Network:
                 if i != j:
                     receivers[j].append(i)
         return {i: tuple(them) for i, them in receivers.items()}
+
+
+def points_in_square(count: int, seed: int) -> Array:
+    """Where `random_geometric` puts its nodes, in the order of their ids: points in the unit square, (count, 2)."""
+    return np.random.default_rng(seed).random((count, 2))
 
 
 def matrix_faults(size: int, matrix: Sequence[Sequence[float]]) -> Iterator[tuple[tuple[()] | tuple[int, int], str]]:

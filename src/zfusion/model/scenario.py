@@ -27,6 +27,8 @@ from zfusion.model.checks import ModelError
 from zfusion.model.network import Network
 from zfusion.model.schema.base import Count, Name, Natural, Reading, Spec
 from zfusion.model.schema.consistency import Parts, problems_between
+from zfusion.model.schema.faults import LinksFile, Timeline
+from zfusion.model.schema.links import LinksSpec
 from zfusion.model.schema.network import AnyGraph
 from zfusion.model.schema.numeric import numeric_system
 from zfusion.model.schema.problems import Located, without
@@ -45,7 +47,7 @@ from zfusion.model.types import NodeId, sorted_ids
 
 T = TypeVar("T")
 
-FINGERPRINT_VERSION = 1
+FINGERPRINT_VERSION = 2
 """Of what a fingerprint is made of; scenarios of different versions never look alike."""
 
 ITEMS_ON_LINES = re.compile(r'\[\n((?:\s*(?:"(?:[^"\\\n]|\\.)*"|[^\[\]{}"\n]+),\n)+)\s*\]')
@@ -58,7 +60,9 @@ ROW_ON_LINE = re.compile(r'\[\n\s*(\[[^\[\]{}"\n]*\]),\n\s*\]')
 class Overrides(TypedDict, total=False):
     """What a command may set in the place of what the scenario says; None changes nothing.
 
-    A rate ends free running and the other way round; another method does not inherit the options of the first.
+    A rate ends free running and the other way round; another method does not inherit the options of the first. What a
+    file of links and faults holds of the two stands in the place of the scenario's; `loss` and `delay`, in seconds, are
+    the `[links]`' own.
     """
 
     steps: int | None
@@ -66,6 +70,9 @@ class Overrides(TypedDict, total=False):
     rate_hz: float | None
     free_run: bool | None
     method: str | None
+    links: str | Path | None
+    loss: float | None
+    delay: float | None
 
 
 class Scenario(Spec):
@@ -84,6 +91,8 @@ class Scenario(Spec):
     source: Source = SimulationSource()
     transport: TransportSpec = TransportSpec()
     recording: RecordingSpec = RecordingSpec()
+    links: LinksSpec = LinksSpec()
+    faults: Timeline = ()
 
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _origin: str = PrivateAttr(default="scenario")
@@ -107,7 +116,17 @@ class Scenario(Spec):
     @model_validator(mode="after")
     def _check(self, info: ValidationInfo) -> Self:
         origin = info.context.source if isinstance(info.context, Reading) else self._origin
-        parts = Parts(self.system_spec, self.sensors, self.noise, self.network_spec, self.source, self.transport)
+        parts = Parts(
+            system=self.system_spec,
+            sensors=self.sensors,
+            noise=self.noise,
+            network=self.network_spec,
+            source=self.source,
+            transport=self.transport,
+            timing=self.timing,
+            links=self.links,
+            faults=self.faults,
+        )
         problems = list(problems_between(parts))
         if not problems:
             try:
@@ -190,14 +209,15 @@ class Scenario(Spec):
             sensor.model_copy(update={"source": sensor.source.with_paths(here)}) if sensor.source else sensor
             for sensor in self.sensors
         )
-        pieces = {name: getattr(self, name).with_paths(here) for name in ("source", "transport", "recording")}
+        pieces = {name: getattr(self, name).with_paths(here) for name in ("source", "transport", "recording", "links")}
         changed = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
         document = self._document() | changed | {"sensors": sensors}
         return self._from_document(document, self._origin, self._directory)
 
     def with_overrides(self, **overrides: Unpack[Overrides]) -> Self:
         """The scenario with these in the place of what it says; ScenarioError if that cannot be."""
-        return self._from_document(_overridden(self._document(), overrides), self._origin, self._directory)
+        origin = _origin_of(self._origin, overrides)
+        return self._from_document(_overridden(self._document(), overrides), origin, self._directory)
 
     def _document(self) -> dict[str, Any]:
         """What was set, as a TOML file holds it."""
@@ -227,6 +247,8 @@ class Scenario(Spec):
             "weights": sorted(self.network.weights.items()),
             "method": self.method.model_dump(),
             "timing": self.timing.facts,
+            "links": self.links.with_paths(_file_name).facts,
+            "faults": [fault.model_dump(exclude_none=True) for fault in self.faults],
             "seed": self.seed,
         }
         text = json.dumps(facts, sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -234,7 +256,7 @@ class Scenario(Spec):
 
     def _sensor_facts(self, i: NodeId) -> dict[str, Any]:
         entry = self._entries[i]
-        source = (entry.source or self.source).with_paths(lambda path: Path(path).name)
+        source = (entry.source or self.source).with_paths(_file_name)
         facts = entry.model_dump(include={"H", "R", "noise"}, exclude_none=True)
         return facts | {"source": source.for_sensor(i).model_dump(exclude_none=True)}
 
@@ -254,15 +276,37 @@ def load_scenario(path: str | Path, **overrides: Unpack[Overrides]) -> Scenario:
     A scenario without a name has that of its file. Raises ScenarioError with everything that is wrong.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        expected = f"expected a scenario file that can be read: {reason}"
-        raise ScenarioError(str(path), [Problem("file", str(path), expected)]) from None
+    text = _text_of(path, "a scenario file")
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", path.stem).lstrip(".-") or "scenario"
     document = {"name": name, **_parsed(text, str(path))}
-    return Scenario._from_document(_overridden(document, overrides), str(path), path.parent)
+    return Scenario._from_document(_overridden(document, overrides), _origin_of(str(path), overrides), path.parent)
+
+
+def _text_of(path: Path, what: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        expected = f"expected {what} that can be read: {reason}"
+        raise ScenarioError(str(path), [Problem("file", str(path), expected)]) from None
+
+
+def _links_file(path: Path) -> dict[str, Any]:
+    """The links and faults that a file holds, as a scenario in any directory may have them."""
+    read = LinksFile._read(_parsed(_text_of(path, "a file of links"), str(path)), str(path))
+    directory = path.parent.absolute()
+    anchored = read.with_paths(lambda name: str(directory / name))
+    return anchored.model_dump(by_alias=True, exclude_unset=True)
+
+
+def _origin_of(origin: str, overrides: Overrides) -> str:
+    """What errors name: with a file of links, it may be that file's fault."""
+    links = overrides.get("links")
+    return origin if links is None else f"{origin} with {links}"
+
+
+def _file_name(path: str) -> str:
+    return Path(path).name
 
 
 def _parsed(text: str, source: str) -> dict[str, Any]:
@@ -287,6 +331,12 @@ def _overridden(document: Mapping[str, Any], overrides: Overrides) -> dict[str, 
     """The document with the overrides that are not None worked in."""
     given = {key: value for key, value in overrides.items() if value is not None}
     changed: dict[str, Any] = {**document, **{key: given[key] for key in ("steps", "seed") if key in given}}
+    if "links" in given:
+        changed |= _links_file(Path(str(given["links"])))
+    of_links = {name: given[name] for name in ("loss", "delay") if name in given}
+    links = changed.get("links", {})
+    if of_links and isinstance(links, Mapping):
+        changed["links"] = {**links, **of_links}
     method = document.get("method")
     if "method" in given and given["method"] != (method.get("name") if isinstance(method, Mapping) else method):
         changed["method"] = {"name": given["method"]}
@@ -319,6 +369,9 @@ def _readable(document: Mapping[str, Any], found: Iterable[Located]) -> Parts:
         network=piece(TypeAdapter(AnyGraph), "network", None),
         source=piece(TypeAdapter(Source), "source", SimulationSource()),
         transport=piece(TypeAdapter(TransportSpec), "transport", TransportSpec()),
+        timing=piece(TypeAdapter(TimingSpec), "timing", TimingSpec()),
+        links=piece(TypeAdapter(LinksSpec), "links", LinksSpec()),
+        faults=piece(TypeAdapter(Timeline), "faults", ()),
     )
 
 

@@ -14,11 +14,13 @@ from typing import Any
 from zfusion.errors import Problem
 from zfusion.model.checks import ModelError, covariance_matrix
 from zfusion.model.schema.base import shortest
+from zfusion.model.schema.faults import Timeline, fault_problems
+from zfusion.model.schema.links import LinksSpec, link_problems
 from zfusion.model.schema.matrices import items_of, shape_of, shape_problems
 from zfusion.model.schema.network import Graph
 from zfusion.model.schema.numeric import size_of
 from zfusion.model.schema.problems import NOT_GIVEN, below
-from zfusion.model.schema.run import CsvSource, Source, TransportSpec
+from zfusion.model.schema.run import CsvSource, Source, TimingSpec, TransportSpec
 from zfusion.model.schema.system import NoiseSpec, SensorSpec, SystemSpec, Taps, is_by_parts
 from zfusion.model.types import NodeId, sorted_ids
 
@@ -35,6 +37,9 @@ class Parts:
     network: Graph | None
     source: Source | None
     transport: TransportSpec | None
+    timing: TimingSpec | None
+    links: LinksSpec | None
+    faults: Timeline | None
 
     @property
     def nx(self) -> int | None:
@@ -75,6 +80,16 @@ def problems_between(parts: Parts) -> Iterator[Problem]:
             yield from (below("network", problem) for problem in parts.network.problems(tuple(sizes)))
         if parts.transport is not None:
             yield from _endpoint_problems(parts.transport, sorted_ids(sizes))
+        yield from _network_event_problems(parts, tuple(sizes))
+
+
+def _network_event_problems(parts: Parts, ids: tuple[NodeId, ...]) -> Iterator[Problem]:
+    graph = parts.network
+    network = graph.network(ids) if graph is not None and not any(graph.problems(ids)) else None
+    if parts.links is not None:
+        yield from link_problems(parts.links, ids, network)
+    if parts.faults is not None and parts.timing is not None:
+        yield from fault_problems(parts.faults, ids, network, parts.timing.period_ns)
 
 
 def _are_ids(ids: Iterable[NodeId]) -> bool:

@@ -15,6 +15,8 @@ from zfusion.model.schema.problems import Faults
 from zfusion.model.types import NodeId
 
 DEFAULT_RATE_HZ = 10.0
+LARGEST_WINDOW = 15
+"""Steps that a message may be late under the policy "revise": a node keeps the states of so many."""
 DEFAULT_DEADLINES: Mapping[str, float] = {"measurement": 0.45, "intermediate": 0.9}
 """Fractions of the period until which a stage's messages are waited for."""
 
@@ -52,18 +54,30 @@ def _epoch(value: object) -> datetime:
 
 
 class TimingSpec(Spec):
-    """When steps are made: `rate_hz` of them a second, or each as soon as the one before is done (`free_run`)."""
+    """When steps are made: `rate_hz` of them a second, or each as soon as the one before is done (`free_run`).
+
+    `late` says what becomes of messages that are: they are not used (drop); they are not used in time, but taken in as
+    long as they are within the `window` (revise); or there is no such thing, as a stage waits for all that it expects,
+    for up to `timeout_s` (wait).
+    """
 
     rate_hz: Positive | None = None
     free_run: Flag = False
     deadlines: dict[str, Fraction] = Field(default_factory=dict)
     timeout_s: Positive = 5.0
+    late: Literal["drop", "revise", "wait"] = "drop"
+    window: Annotated[int, Field(strict=True, ge=1, le=LARGEST_WINDOW)] = 8
     epoch: Annotated[datetime, PlainValidator(_epoch)] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.free_run and self.rate_hz is not None:
             raise ValueError("expected either rate_hz or free_run = true")
+        if "window" in self.model_fields_set and self.late != "revise":
+            raise Faults([Problem("window", self.window, 'expected late = "revise" with it: there is no window else')])
+        if self.deadlines and self.late == "wait":
+            expected = 'expected none, as late = "wait" knows no deadlines, only timeout_s'
+            raise Faults([Problem("deadlines", dict(self.deadlines), expected)])
         waits = self.fractions
         if not waits["measurement"] < waits["intermediate"]:
             expected = "expected the deadline of measurement before that of intermediate"
@@ -86,6 +100,11 @@ class TimingSpec(Spec):
         return round(NANOSECONDS * self.timeout_s)
 
     @property
+    def revised_steps(self) -> int:
+        """How many steps late a message may be and still be taken in."""
+        return self.window if self.late == "revise" else 0
+
+    @property
     def epoch_ns(self) -> int | None:
         """The time of step 0 in nanoseconds since 1970, where the scenario fixes it."""
         if self.epoch is None:
@@ -101,6 +120,8 @@ class TimingSpec(Spec):
             "timeout_ns": self.timeout_ns,
             "deadlines": dict(self.fractions),
             "epoch_ns": self.epoch_ns,
+            "late": self.late,
+            "window": self.revised_steps,
         }
 
     def deadline_ns(self, stage: str) -> int:
