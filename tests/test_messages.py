@@ -20,11 +20,13 @@ from zfusion import messages
 from zfusion.errors import MessageError
 from zfusion.messages import Decoder, Reason, decode_any, encode, json_schema, read_stamp
 from zfusion.stages import (
+    ARRIVALS,
     BUILT_IN,
     ESTIMATE,
     EVENT,
     INTERMEDIATE,
     MEASUREMENT,
+    REVISED,
     TRUTH,
     TRUTH_SENDER,
     Field,
@@ -40,7 +42,9 @@ FIELDS: dict[Stage, dict[str, Any]] = {
     MEASUREMENT: {"y": [1.5, -0.25, 3.0]},
     INTERMEDIATE: {"x": [0.5, 2.0], "used": [1, 2], "history": [[3, [1, 2, 5]], [6, []]]},
     ESTIMATE: {"x": [0.5, 2.0], "P": [4.0, 1.0, 1.0, 3.0], "shape": [2, 2], "used": [1, 5], "excluded": [2]},
+    REVISED: {"x": [0.5, 2.0], "P": [4.0, 1.0, 1.0, 3.0], "shape": [2, 2], "used": [1, 5], "excluded": [2], "at": 12},
     EVENT: {"kind": "late", "data": {"from": 5, "by_ns": 1200, "why": ["x", None, True, 1.5]}},
+    ARRIVALS: {"data": {"edges": [{"from": 1, "stage": "measurement", "steps": [[1, 2]], "latency_ns": [5, 7]}]}},
     TRUTH: {"x": [0.5, 2.0]},
 }
 

@@ -20,6 +20,7 @@ from simulations import (
     altered,
     by_rule,
     four_sensor,
+    losing,
     payloads,
     record,
     record_story,
@@ -30,12 +31,12 @@ from simulations import (
     writer_for,
 )
 from zfusion.drivers import replayed
-from zfusion.drivers.links import Dropping, Edge, Link, ideal
 from zfusion.drivers.replayed import verify
 from zfusion.drivers.rerun import rerun
 from zfusion.drivers.simulated import EPOCH_NS, Simulation
 from zfusion.drivers.verdict import TOLERANCE, Verdict, ulps_apart
 from zfusion.errors import InputError
+from zfusion.links import Edge, Link, ideal
 from zfusion.messages import decode_any, encode_any
 from zfusion.model.scenario import Scenario
 from zfusion.recording import Record, Recording
@@ -56,7 +57,7 @@ def next_float(x: float) -> float:
 
 def assert_all_identical(path: Path, count: int | None = None) -> Verdict:
     verdict = verdict_on(path)
-    published = len(payloads(path, "intermediate")) + len(payloads(path, "estimate"))
+    published = sum(len(payloads(path, stage)) for stage in ("intermediate", "estimate", "revised"))
     assert (verdict.different, verdict.unverifiable, verdict.cut_off) == (0, 0, 0), verdict.first or verdict.missing
     assert verdict.identical == published
     assert count is None or published == count
@@ -77,13 +78,13 @@ def bursts(edge: Edge, message: Message) -> int | None:
     ("scenario", "link"),
     [
         (four_sensor(40), ideal),
-        (four_sensor(40), Dropping(0.2, seed=3)),
-        (walk(40), Dropping(0.4, seed=4)),
-        (walk(20, names=True), Dropping(0.1, seed=5)),
-        (walk(30, timing={"free_run": True}), Dropping(0.1, seed=6)),
+        (four_sensor(40), losing(0.2, seed=3)),
+        (walk(40), losing(0.4, seed=4)),
+        (walk(20, names=True), losing(0.1, seed=5)),
+        (walk(30, timing={"free_run": True}), losing(0.1, seed=6)),
         (walk(20), by_rule(lambda edge, message: (7 * edge[0] + 3 * edge[1] + message.step) % 12 * MS)),
         (walk(10, method="local"), ideal),
-        (walk(10, method="centralized"), Dropping(0.3, seed=7)),
+        (walk(10, method="centralized"), losing(0.3, seed=7)),
     ],
 )
 def test_everything_is_identical(tmp_path: Path, scenario: Scenario, link: Link) -> None:
@@ -92,6 +93,72 @@ def test_everything_is_identical(tmp_path: Path, scenario: Scenario, link: Link)
     verdict = assert_all_identical(path, stages * scenario.steps * len(scenario.ids))
     assert verdict.lives == len(scenario.ids)
     assert verdict.tolerance is None
+
+
+def late(edge: Edge, message: Message) -> int | None:
+    """A tenth is lost, and a quarter is late by up to six steps of 20 ms."""
+    random = Random(f"{edge} {message.stage} {message.step}")
+    fate = random.random()
+    return None if fate < 0.1 else random.randrange(120 * MS) if fate < 0.35 else MS
+
+
+REVISING: dict[str, Any] = {"timing": {"rate_hz": 50.0, "late": "revise", "window": 4}}
+
+
+@pytest.mark.parametrize("method", ["two_stage", "centralized"])
+@pytest.mark.parametrize("timing", [{"late": "revise", "window": 3}, {"late": "wait", "timeout_s": 0.03}])
+def test_whatever_becomes_of_what_is_late(tmp_path: Path, method: str, timing: dict[str, Any]) -> None:
+    def tell(simulation: Simulation) -> None:
+        simulation.run(EPOCH_NS + 12 * 20 * MS)
+        simulation.kill(20)
+        simulation.run(EPOCH_NS + 16 * 20 * MS)
+        simulation.revive(20)
+
+    path = tmp_path / "r.mcap"
+    scenario = walk(30, timing={"rate_hz": 50.0, **timing}, method=method)
+    simulation = record_story(path, scenario, tell, by_rule(late))
+    assert assert_all_identical(path).lives == 6
+    corrected = payloads(path, "revised")
+    assert (len(corrected) > 30) == ("window" in timing)
+    assert all(1 <= p["at"] - p["step"] <= 3 for p in corrected)
+    lives = [report for lives in simulation.reports.values() for report in lives]
+    taken = [edge["revised"].get("measurement", 0) for report in lives for edge in report.edges.values()]
+    assert (sum(taken) > 30) == ("window" in timing)
+
+
+def test_what_is_wrong_with_a_corrected_estimate_or_missing(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", walk(20, **REVISING), by_rule(late))
+    whole = assert_all_identical(path)
+    first, second = payloads(path, "revised", 10)[1:3]
+
+    def change(old: Record, **changes: Any) -> list[Record]:
+        payload = decode_any(old.data)
+        here = old.topic.endswith("/node/10/revised") and payload["seq"] == 1
+        return [old._replace(data=encode_any({**payload, **changes}))] if here else [old]
+
+    wrong = rewrite(
+        path, tmp_path / "wrong.mcap", lambda old: change(old, x=[first["x"][0], next_float(first["x"][1])])
+    )
+    verdict = verdict_on(wrong)
+    assert (verdict.different, verdict.identical) == (1, whole.identical - 1)
+    assert verdict.first is not None
+    assert (verdict.first.node, verdict.first.step, verdict.first.stage) == (10, first["step"], "revised")
+    moved = rewrite(path, tmp_path / "moved.mcap", lambda old: change(old, at=first["at"] + 1))
+    assert verdict_on(moved).different == 1
+    lost = without(path, tmp_path / "lost.mcap", (10, "revised", first["step"]))
+    gone = len(payloads(path, "revised", 10)) - len(payloads(lost, "revised", 10))
+    verdict = verdict_on(lost)
+    assert (verdict.different, verdict.unverifiable, verdict.identical) == (0, gone, whole.identical - gone)
+    assert second["seq"] == 2
+
+
+def test_a_revision_that_nobody_told_proves_nothing(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", walk(20, **REVISING), by_rule(late))
+    event = next(p for p in payloads(path, "event", 10) if p["kind"] == "revised")
+    verdict = verdict_on(without(path, tmp_path / "x.mcap", (10, "event", event["step"])))
+    assert not verdict.different
+    assert verdict.unverifiable > 10
+    assert "x event of node 10" in verdict.missing[0]
 
 
 def test_several_processes_find_what_one_does(tmp_path: Path) -> None:
@@ -314,14 +381,14 @@ def test_a_recording_that_was_broken_off_anywhere(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     scenario = walk(12)
     with writer_for(path, scenario) as writer:
-        everything = records(record(tmp_path / "whole.mcap", scenario, Dropping(0.1, seed=1)))
+        everything = records(record(tmp_path / "whole.mcap", scenario, losing(0.1, seed=2)))
         for n, (topic, data, log_time, *_) in enumerate(everything):
             writer.write(topic, data, log_time)
             if n % 7 == 0:
                 writer.flush()
     whole = path.read_bytes()
     seen = set()
-    for size in range(len(whole) // 3, len(whole), len(whole) // 40):
+    for size in range(len(whole) // 3, len(whole), len(whole) // 50):
         path.write_bytes(whole[:size])
         verdict = verdict_on(path)
         assert (verdict.different, verdict.unverifiable) == (0, 0), verdict.missing
@@ -337,7 +404,7 @@ def test_what_the_recorder_heard_in_another_order_than_the_nodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One node's messages come much later than the others', each in its own order."""
-    path = record(tmp_path / "r.mcap", walk(40), Dropping(0.2, seed=2))
+    path = record(tmp_path / "r.mcap", walk(40), losing(0.2, seed=2))
     late = rewritten_in_order(path, tmp_path / "x.mcap", lambda r: "/node/20/" in r.topic)
     assert_all_identical(late)
     monkeypatch.setattr(replayed, "WAIT_STEPS", 16)
@@ -365,12 +432,12 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path, monkeypatch: py
         most = max(most, *(len(of) for shelf in self._shelves.values() for of in shelf.by_stage.values()))
 
     monkeypatch.setattr(replayed._Verifier, "_tidy", watched)
-    assert_all_identical(record(tmp_path / "r.mcap", walk(120), Dropping(0.1, seed=2)))
+    assert_all_identical(record(tmp_path / "r.mcap", walk(120), losing(0.1, seed=2)))
     assert 0 < most <= 16
 
 
 def test_garbage_repetitions_and_strangers_change_nothing(tmp_path: Path) -> None:
-    path = record(tmp_path / "r.mcap", walk(10), Dropping(0.2, seed=1))
+    path = record(tmp_path / "r.mcap", walk(10), losing(0.2, seed=1))
     random = Random(1)
 
     def disturbed(old: Record) -> Iterable[Record]:
@@ -496,7 +563,7 @@ def test_a_rerun_changes_only_what_it_is_told_to(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", walk(12))
     with Recording.open(path) as recording:
         again = rerun(recording, {}, tmp_path / "again.mcap")
-        lossy = rerun(recording, {}, tmp_path / "lossy.mcap", link=Dropping(0.3, seed=1), run="lossy")
+        lossy = rerun(recording, {}, tmp_path / "lossy.mcap", link=losing(0.3, seed=1), run="lossy")
     assert {(change.compared, change.rms) for change in again.changes.values()} == {(12, 0.0)}
     assert all(change.before == change.after for change in again.changes.values())
     assert all(change.compared == 12 and change.rms for change in lossy.changes.values())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import cast
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -150,3 +153,57 @@ def test_a_new_life_begins_with_nothing_and_a_former_one_is_not_listened_to() ->
     assert ledger.take_changes() == {2: 5}
     assert history.first_unknown(1, 9) is None
     assert ledger.of(3) is None
+
+
+# --- senders that revise
+
+
+@fixed
+@given(st.data(), st.integers(1, 5), st.integers(0, 3))
+def test_what_a_sender_may_have_revised_is_never_taken_for_known(data: st.DataObject, window: int, more: int) -> None:
+    """Whatever is known of a step, after any message, is what that message was computed with, or nothing is known."""
+    sender, ledger, then = Ledger("j", 1, window), Ledger("i", 1, window), dict[int, list[UsedSet | None]]()
+    for step in range(1, LAST):
+        for past in range(max(1, step - window), step):
+            if data.draw(st.integers(0, 4)) == 0:
+                sender.revise(past, data.draw(st.sampled_from(SETS)))
+        used = data.draw(st.sampled_from(SETS))
+        sender.learn("j", 1, step, used)
+        own, known = sender.of("j"), ledger.of("j")
+        assert own is not None
+        then[step] = [own.at(past) for past in range(step + 1)]
+        if data.draw(st.integers(0, 3)) == 0 and known is not None:  # an answer, of now or of an earlier moment
+            end = data.draw(st.integers(1, step))
+            final = end - window
+            answer = [run for run in own.runs(step) if run[0] <= final]
+            ledger.fill("j", 1, final, answer)
+            assert all(known.at(past) in (None, then[known.last][past]) for past in range(1, known.last + 1))
+        if data.draw(st.booleans()):
+            ledger.learn("j", 1, step, used, own.runs(step - 1, window + more))
+            known = ledger.of("j")
+            assert known is not None
+            assert known.at(step) == used
+            assert all(known.at(past) in (None, then[step][past]) for past in range(1, step))
+            assert all(known.at(past) is not None for past in range(max(1, step - window), step))
+            past = data.draw(st.integers(1, step))
+            told = [run for run in runs_of(then[past]) if run[0] < past][-(window + 1) :]
+            agrees = ledger.agrees("j", 1, past, cast(UsedSet, then[past][past]), told)
+            assert agrees <= all(known.at(s) in (None, then[past][s]) for s in range(1, past + 1))
+            assert agrees or any(known.at(s) != then[past][s] for s in range(1, past + 1))
+
+
+def runs_of(sets: Sequence[UsedSet | None]) -> list[Run]:
+    """The sets of steps 1, 2, ... as runs."""
+    return [(s, cast(UsedSet, u)) for s, u in enumerate(sets) if s and (s == 1 or u != sets[s - 1])]
+
+
+def test_a_message_that_tells_less_than_may_have_been_revised_leaves_the_rest_unknown() -> None:
+    history = History(1)
+    for step in range(1, 9):
+        history.learn(step, SETS[1])
+    assert history.learn(9, SETS[2], [(8, SETS[1])], window=3) == 6
+    assert [history.at(step) for step in range(5, 10)] == [SETS[1], None, None, SETS[1], SETS[2]]
+    assert history.learn(7, SETS[3], (), window=3) is None  # older than what was heard last
+    assert history.at(7) is None
+    assert history.learn(20, SETS[2], (), window=3) == 8  # 6 and 7 were not known before
+    assert [history.at(step) for step in (6, 7, 9, 19, 20)] == [None, None, None, None, SETS[2]]

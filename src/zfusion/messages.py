@@ -105,13 +105,13 @@ class Stamp(NamedTuple):
     t_ns: int
 
 
-def encode(message: Message) -> bytes:
-    """The payload of `message`. Its arrays must be float64: this is the node's own word, it is not checked."""
+def encode(message: Message, sent_ns: int | None = None) -> bytes:
+    """The payload of `message`, as sent then. Its arrays must be float64: it is the node's own word, unchecked."""
     payload: dict[str, object] = {
         "v": VERSION,
         "node": message.node,
         "step": message.step,
-        "t_ns": message.t_ns,
+        "t_ns": message.t_ns if sent_ns is None else sent_ns,
         "seq": message.seq,
         "born": message.born,
     }
@@ -250,6 +250,7 @@ _SCHEMAS: dict[Kind, dict[str, object]] = {
     Kind.OPTIONAL_VECTOR: {**_NUMBERS, "type": ["array", "null"]},
     Kind.MATRIX: _NUMBERS,
     Kind.IDS: _IDS_SCHEMA,
+    Kind.STEP: {"type": "integer", "minimum": 1},
     Kind.HISTORY: {"type": "array", "items": _RUN_SCHEMA},
     Kind.TEXT: {"type": "string", "maxLength": MAX_TEXT},
     Kind.MAP: {"type": "object"},
@@ -286,6 +287,7 @@ def _limits(stage: Stage, node: NodeId, sizes: Mapping[str, int], ids: frozenset
             Kind.OPTIONAL_VECTOR: _HEAD_BYTES + numbers * _NUMBER_BYTES,
             Kind.MATRIX: 2 * _HEAD_BYTES + (numbers + 2) * _NUMBER_BYTES,
             Kind.IDS: id_bytes,
+            Kind.STEP: _NUMBER_BYTES,
             Kind.HISTORY: _HEAD_BYTES + MAX_HISTORY_RUNS * (_HEAD_BYTES + _NUMBER_BYTES + id_bytes),
             Kind.TEXT: _HEAD_BYTES + _MAX_STRING_BYTES,
             Kind.MAP: MAX_MAP_BYTES,
@@ -394,6 +396,17 @@ def _ids(name: str, _shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Reade
     return read
 
 
+def _step(name: str, _shape: tuple[int, ...], _legal: frozenset[NodeId]) -> _Reader:
+    def read(step: Any, _raw: _Raw) -> int:
+        if type(step) is not int:
+            raise _wrong_type(name, step, "an integer")
+        if not 1 <= step <= MAX_STEP:
+            raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {step}")
+        return step
+
+    return read
+
+
 def _history(name: str, shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Reader:
     read_ids = _ids(name, shape, legal)
 
@@ -443,6 +456,7 @@ _READERS: dict[Kind, Callable[[str, tuple[int, ...], frozenset[NodeId]], _Reader
     Kind.OPTIONAL_VECTOR: _optional_vector,
     Kind.MATRIX: _matrix,
     Kind.IDS: _ids,
+    Kind.STEP: _step,
     Kind.HISTORY: _history,
     Kind.TEXT: _text,
     Kind.MAP: _map,

@@ -12,19 +12,25 @@ its own messages say it used reproduces them.
 
 What is used of a neighbour is decided in one place: what has arrived when a stage closes (`_close`). All else that
 can happen to a message ends in a counter: late, duplicate, too early, from a former life, from a stranger.
+
+A node with a `window` *revises*: what comes late, but within so many steps, it takes in when the same stage closes
+again. Late measurements when the first stage does (`_revise`): then its filter stands where it would have stood had
+they been in time. Late messages of the last stage when that does (`_correct`), to correct the estimates of past steps.
+It tells of both in events "revised", from which a replay knows what came when.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import cast
 
 from zfusion.gaps import GapCounter
-from zfusion.methods.protocol import Fields, Method, Outcome
+from zfusion.methods.protocol import Fields, Method, Outcome, Revising
 from zfusion.model.types import Array, NodeId, sorted_ids
-from zfusion.stages import ESTIMATE, EVENT, Message
+from zfusion.stages import ESTIMATE, EVENT, REVISED, Message
 from zfusion.used_sets import HISTORY_RUNS, Ledger, Run, UsedSet
 
 LOOKAHEAD = 64
@@ -44,7 +50,10 @@ ANSWERS = 1024
 """Answers to questions for a history that wait for the step's end; nobody has so many neighbours."""
 
 NAMED = 128
-"""Ids in one event that tells a history: about a kilobyte, where an event may have four."""
+"""Ids in one event that tells a history or a revision: about a kilobyte, where an event may have four."""
+
+BETTER = 1e-9
+"""The part by which the trace of its P must be smaller for a corrected estimate to be told: less is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +84,13 @@ class EdgeCounters:
     """By stage: in time, and used."""
     late: Counter[str] = field(default_factory=Counter)
     """By stage: first seen when the stage was over."""
+    revised: Counter[str] = field(default_factory=Counter)
+    """By stage: of the late, those that a node that revises has taken in after all."""
+    too_late: Counter[str] = field(default_factory=Counter)
+    """By stage: of the late, those that came when the window of a node that revises was over."""
+    stale: Counter[str] = field(default_factory=Counter)
+    """By stage: of the late within the window, those that could not be used: the sender has used more since than they
+    were computed with, or it is not known what that was."""
     missed: Counter[str] = field(default_factory=Counter)
     """By stage: not there at the deadline although expected."""
     refused: Counter[str] = field(default_factory=Counter)
@@ -99,8 +115,13 @@ class Node:
         *,
         born: int = 1,
         expected: Collection[NodeId] | None = None,
+        window: int = 0,
     ) -> None:
-        """`expected`: the neighbours that are there from the start (default: all); it waits for no others."""
+        """`expected`: the neighbours that are there from the start (default: all); it waits for no others.
+
+        `window`: by how many steps a message may be late and be taken in; more than 0 with a `Revising` method only,
+        made for the same.
+        """
         self.id = node
         self.born = born
         self.neighbours = tuple(j for j in sorted_ids(neighbourhood) if j != node)
@@ -110,8 +131,10 @@ class Node:
         """Neighbours' estimates left out because their history was not known, counted once a step each."""
         self.strays = 0
         """Messages from no neighbour, or of no stage of the method."""
+        self.taken = 0
+        """Messages that were taken in, in time or late: all that were neither strays nor refused."""
         self.completed = 0
-        self.ledger = Ledger(node, born)
+        self.ledger = Ledger(node, born, window)
         self.step = born - 1
         self.deadline: int | None = None
         """When `tick` must be called; None while idle."""
@@ -131,9 +154,17 @@ class Node:
         self._there = set(self._expected)
         self._renewed: set[NodeId] = set()
         self._lives: dict[NodeId, int] = {}
-        self._lives_heard: dict[NodeId, int] = {}
+        self._heard: dict[NodeId, Message] = {}
+        """The last message of each that was used."""
         self._asked: dict[NodeId, int] = {}
         self._told: list[tuple[NodeId, int, int, Sequence[Run]]] = []
+        self._window = window
+        self._late: dict[int, dict[int, dict[NodeId, Message]]] = {}
+        """By stage and step: what came late and is to be taken in."""
+        self._estimated: dict[int, _Estimated] = {}
+        """The steps within the window of which an estimate was told."""
+        self._revised_from = NEVER
+        """The first step of which measurements were taken in since the last estimate."""
 
     @property
     def stage(self) -> str | None:
@@ -181,13 +212,14 @@ class Node:
         if refusal is not None:
             counters.refused[refusal] += 1
             return []
+        self.taken += 1
         counters.gaps[message.stage].observe(message.born, message.seq)
         present = self._stage if self._stage >= 0 else len(self._stages)
         late = step < self.step or (step == self.step and stage < present)
         self._note_presence(message, late)
         effects: list[Effect] = []
         if late:
-            counters.late[message.stage] += 1
+            self._note_late(message, stage)
         elif step > self.step or stage > self._stage:
             self._early.setdefault((step, stage), {})[j] = message
         else:
@@ -218,6 +250,16 @@ class Node:
         if of in self.counters and runs and len(self._told) < ANSWERS:
             self._told.append((of, born, end, runs))
 
+    def tell_history(self) -> tuple[int, int, list[Run]]:
+        """What a neighbour that asks is to learn: born, end and runs of the own used sets.
+
+        What may still be revised is not in it: nobody could tell with which message it goes together.
+        """
+        own = self.ledger.of(self.id)
+        assert own is not None  # the ledger begins with it
+        end = own.last - self._window
+        return self.born, end, own.runs(end)
+
     def event(self, kind: str, now: int, **details: object) -> Message:
         """A message on the node's event key."""
         return self._message(EVENT.name, {"kind": kind, "data": details}, now)
@@ -247,18 +289,24 @@ class Node:
         return None
 
     def _forget_former_life(self, j: NodeId, born: int) -> None:
-        """What it had said in advance of steps of the new life does not count any more: it says it again."""
+        """What it had said in advance of steps of the new life does not count any more: it says it again.
+
+        Nor does what came late and was not taken in yet: one is never heard again once the other has been.
+        """
         for at, messages in self._early.items():
             if at[0] >= born and messages.pop(j, None) is not None:
                 self.counters[j].refused["former_life"] += 1
         for step, seen in self._seen.items():
             if step >= born:
                 seen.difference_update([(stage, j) for stage in self._number.values()])
+        for late in self._late.values():
+            for messages in late.values():
+                messages.pop(j, None)
 
     def _note_presence(self, message: Message, late: bool) -> None:
         """Whose message it is, is there: wait for it, from the first step that it can be in time for."""
         j = message.node
-        if self._lives.get(j) != message.born:
+        if self._lives.get(j) != message.born and message.step >= self.born:  # what is older tells of no present life
             self._lives[j] = message.born
             self._renewed.discard(j)
         if j not in self._expected and j in self._there:
@@ -268,7 +316,7 @@ class Node:
         """Into the present stage."""
         j = message.node
         self._arrived[j] = message.fields
-        self._lives_heard[j] = message.born
+        self._heard[j] = message
         self._missing.discard(j)
         self.counters[j].received[message.stage] += 1
 
@@ -294,6 +342,8 @@ class Node:
             self.counters[j].missed[name] += 1
         if stage > 0:
             self._learn(arrived)
+        elif self._late:
+            self._revise(now, effects)
         if stage == len(self._stages) - 1 and self._told:
             self._take_histories(now, effects)
         result = self._method.advance(stage, self.step, arrived, self.ledger)
@@ -302,13 +352,59 @@ class Node:
         else:
             self._open(stage + 1, self._with_history(result), now, effects)
 
+    def _note_late(self, message: Message, stage: int) -> None:
+        """Count what is late; if it is within the window, keep it until its stage closes again."""
+        counters, step = self.counters[message.node], message.step
+        counters.late[message.stage] += 1
+        if not self._window or step < self.born or stage not in (0, len(self._stages) - 1):
+            return
+        if message.born != self._lives.get(message.node):
+            return  # its sender's new life was heard before this could be used
+        if step < self._closing(stage) - self._window:
+            counters.too_late[message.stage] += 1
+        else:
+            self._late.setdefault(stage, {}).setdefault(step, {})[message.node] = message
+
+    def _closing(self, stage: int) -> int:
+        """The step whose `stage` closes next, if none is slept through."""
+        return self.step if 0 <= self._stage <= stage else self.step + 1
+
+    def _pop_late(self, stage: int) -> dict[int, dict[NodeId, Message]]:
+        """What came late of a stage that closes now, by step, ascending; what is too late by now is counted."""
+        late = self._late.pop(stage, {})
+        for step in [step for step in late if step < self.step - self._window]:
+            for message in late.pop(step).values():
+                self.counters[message.node].too_late[message.stage] += 1
+        return {step: late[step] for step in sorted(late) if late[step]}
+
+    def _revise(self, now: int, effects: list[Effect]) -> None:
+        """Go back to the steps of which measurements came late, and forward again with them."""
+        late = self._pop_late(0)
+        fields = {step: {j: message.fields for j, message in messages.items()} for step, messages in late.items()}
+        taken = cast(Revising, self._method).revise(fields)
+        own = self.ledger.of(self.id)
+        assert own is not None  # the ledger begins with it
+        for step, ids in taken.items():
+            for j in ids:
+                self.counters[j].revised[self._stages[0]] += 1
+            used = own.at(step)
+            if used is not None:
+                self.ledger.revise(step, tuple(sorted_ids({*used, *ids})))
+            self._revised_from = min(step, self._revised_from)
+        self._tell_taken(self._stages[0], taken, now, effects)
+
+    def _tell_taken(self, stage: str, taken: Mapping[int, UsedSet], now: int, effects: list[Effect]) -> None:
+        """What was late and is taken in, in events of bounded size."""
+        for piece in _bounded(taken.items()):
+            effects.append(self.event("revised", now, stage=stage, taken=piece))
+
     def _learn(self, arrived: Mapping[NodeId, Fields]) -> None:
         """What the neighbours say they used."""
         for j in self.neighbours:
             fields = arrived.get(j)
             if fields is not None and "history" in fields:
                 used, history = cast(UsedSet, fields["used"]), cast("Sequence[Run]", fields["history"])
-                self.ledger.learn(j, self._lives_heard[j], self.step, used, history)
+                self.ledger.learn(j, self._heard[j].born, self.step, used, history)
 
     def _take_histories(self, now: int, effects: list[Effect]) -> None:
         """Histories that were asked for enter here, and are told, in events of bounded size: a replay needs them."""
@@ -326,9 +422,50 @@ class Node:
         self.ledger.learn(self.id, self.born, self.step, cast(UsedSet, used))
         own = self.ledger.of(self.id)
         assert own is not None  # the ledger begins with it
-        return {**fields, "history": tuple(own.runs(self.step - 1, HISTORY_RUNS))}
+        return {**fields, "history": tuple(own.runs(self.step - 1, HISTORY_RUNS + self._window))}
+
+    def _correct(self, now: int, effects: list[Effect]) -> None:
+        """Tell better estimates of past steps, where what has come since makes them better."""
+        late = self._pop_late(len(self._stages) - 1) if len(self._stages) > 1 else {}
+        late = {step: messages for step, messages in late.items() if step in self._estimated}
+        for step, messages in late.items():
+            self._estimated[step].heard.update(messages)
+        self._tell_taken(self._stages[-1], {step: tuple(sorted_ids(late[step])) for step in late}, now, effects)
+        for step, estimated in self._estimated.items():
+            if step < self._revised_from and step not in late:
+                continue
+            outcome = cast(Revising, self._method).correct(step, self._agreeing(estimated.heard))
+            for j, message in late.get(step, {}).items():
+                counters = self.counters[j]
+                (counters.revised if j in outcome.used else counters.stale)[message.stage] += 1
+            variance = float(outcome.P.trace())
+            if variance < (1 - BETTER) * estimated.variance:
+                estimated.variance = variance
+                excluded = tuple(j for j in self.neighbours if j in estimated.heard and j not in outcome.used)
+                fields = {"x": outcome.x, "P": outcome.P, "used": outcome.used, "excluded": excluded, "at": self.step}
+                effects.append(self._message(REVISED.name, fields, now)._replace(step=step))
+        self._revised_from = NEVER
+
+    def _agreeing(self, heard: Mapping[NodeId, Message]) -> dict[NodeId, Fields]:
+        """The messages of the last stage that were computed with just what is known of their senders now."""
+        agreeing = {}
+        for j, message in heard.items():
+            used, history = cast(UsedSet, message.fields["used"]), cast("Sequence[Run]", message.fields["history"])
+            if self.ledger.agrees(j, message.born, message.step, used, history):
+                agreeing[j] = message.fields
+        return agreeing
+
+    def _remember(self, outcome: Outcome) -> None:
+        """Keep what it takes to correct this step's estimate later."""
+        heard = {j: self._heard[j] for j in self._arrived if j != self.id} if len(self._stages) > 1 else {}
+        self._estimated[self.step] = _Estimated(heard, float(outcome.P.trace()))
+        for step in [step for step in self._estimated if step < self.step + 1 - self._window]:
+            del self._estimated[step]
 
     def _finish(self, outcome: Outcome, now: int, effects: list[Effect]) -> None:
+        if self._window:
+            self._correct(now, effects)
+            self._remember(outcome)
         self._stage, self.deadline, self.estimate = -1, None, outcome
         self._missing = set()
         self.completed += 1
@@ -349,24 +486,41 @@ class Node:
         """Drop what was kept for steps that are over; what came early for them has become late."""
         if self._early:
             for at in [at for at in self._early if at[0] < step]:
-                for j in self._early.pop(at):
-                    self.counters[j].late[self._stages[at[1]]] += 1
+                for message in self._early.pop(at).values():
+                    self._note_late(message, at[1])
         self._seen.pop(step - REMEMBERED, None)
         if step > self.step + 1:
             self._seen = {at: seen for at, seen in self._seen.items() if at > step - REMEMBERED}
 
 
+@dataclass(slots=True)
+class _Estimated:
+    """A past step of which an estimate was told."""
+
+    heard: dict[NodeId, Message]
+    """The neighbours' messages of its last stage, in time or late."""
+    variance: float
+    """Trace of P of the last estimate that was told of it."""
+
+
 def _pieces(runs: Sequence[Run], end: int) -> Iterator[tuple[list[Run], int]]:
-    """The runs up to `end` in pieces that name at most about NAMED ids each, and the last step of each piece."""
-    piece: list[Run] = []
+    """The runs up to `end` in pieces of bounded size, and the last step of each piece."""
+    pieces = list(_bounded([run for run in runs if run[0] <= end]))
+    for piece, following in pairwise(pieces):
+        yield piece, following[0][0] - 1
+    if pieces:
+        yield pieces[-1], end
+
+
+def _bounded(named_at: Iterable[tuple[int, UsedSet]]) -> Iterator[list[tuple[int, UsedSet]]]:
+    """Steps with ids, in pieces that name at most about NAMED ids each."""
+    piece: list[tuple[int, UsedSet]] = []
     named = 0
-    for first, used in runs:
-        if first > end:
-            break
+    for step, ids in named_at:
         if named >= NAMED:
-            yield piece, first - 1
+            yield piece
             piece, named = [], 0
-        piece.append((first, used))
-        named += 1 + len(used)
+        piece.append((step, ids))
+        named += 1 + len(ids)
     if piece:
-        yield piece, end
+        yield piece

@@ -39,6 +39,8 @@ class Kind(Enum):
     """Read-only float64 array (rows, columns)   [row-major list of floats, and ``shape: [rows, columns]``]."""
     IDS = "node ids"
     """Tuple of node ids, ascending, each once   [list of ids]."""
+    STEP = "step"
+    """A step k >= 1, int   [int]."""
     HISTORY = "history"
     """Tuple of (first step, ids), ascending, all before the message's step   [list of [first step, list of ids]]."""
     TEXT = "text"
@@ -133,6 +135,17 @@ ESTIMATE = Stage(
     ),
     "the node's result",
 )
+REVISED = Stage(
+    "revised",
+    (
+        Field("x", Kind.VECTOR, ("nx",), "the corrected estimate of a past step"),
+        Field("P", Kind.MATRIX, ("nx", "nx"), "its predicted error covariance"),
+        Field("used", Kind.IDS, (), "whose messages of that step went in"),
+        Field("excluded", Kind.IDS, (), "whose had come by then but were left out: the senders have since used more"),
+        Field("at", Kind.STEP, (), "the step at whose end it was made"),
+    ),
+    "an estimate of a past step, corrected by what came late",
+)
 EVENT = Stage(
     "event",
     (
@@ -141,7 +154,19 @@ EVENT = Stage(
     ),
     "something out of the ordinary that happened to a node",
 )
+ARRIVALS = Stage(
+    "arrivals",
+    (
+        Field(
+            "data",
+            Kind.MAP,
+            (),
+            "edges: a list of {from, stage, steps: [[first, count], ...], latency_ns: [...]}, one latency a step",
+        ),
+    ),
+    "how long its neighbours' messages took to a node, of many steps at once",
+)
 TRUTH = Stage("truth", (Field("x", Kind.VECTOR, ("nx",), "the true state"),), "the state itself, where it is known")
 
-BUILT_IN = (MEASUREMENT, INTERMEDIATE, ESTIMATE, EVENT, TRUTH)
+BUILT_IN = (MEASUREMENT, INTERMEDIATE, ESTIMATE, REVISED, EVENT, ARRIVALS, TRUTH)
 """The stages that a recording may hold whatever the method; a method may add its own."""

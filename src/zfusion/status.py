@@ -42,6 +42,11 @@ class Status:
     fallbacks: int = 0
     estimate: Mapping[str, list[float]] = field(default_factory=dict)
     """The last one, where there is one: x, and sd, the standard deviations of its errors. For people to look at."""
+    machine: str | None = None
+    """Of nodes that tell the same here the clocks are one; None where nothing can be said."""
+    heard_ns: int = 0
+    """When the question was heard that this answers, and when the answer was told, on the node's clock."""
+    told_ns: int = 0
     zfusion: str = version("zfusion")
     wire: int = VERSION
 
@@ -69,6 +74,9 @@ class Status:
                 ready={_id(i): int(start) for i, start in _typed(raw, "ready", list)},
                 completed=_typed(raw, "completed", int),
                 fallbacks=_typed(raw, "fallbacks", int),
+                machine=None if raw["machine"] is None else _typed(raw, "machine", str),
+                heard_ns=_typed(raw, "heard_ns", int),
+                told_ns=_typed(raw, "told_ns", int),
                 zfusion=_typed(raw, "zfusion", str),
                 wire=_typed(raw, "wire", int),
             )

@@ -7,8 +7,8 @@ neighbours can go on after messages were lost; what they still do not know is a 
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from zfusion.model.types import NodeId
@@ -19,7 +19,8 @@ Run = tuple[int, UsedSet]
 
 HISTORY_RUNS = 16
 """Runs that a message carries. Only changes start a run: with no event one run says all; with a change at every
-step a neighbour may lose 16 messages in a row before it has to ask."""
+step a neighbour may lose 16 messages in a row before it has to ask. A node that revises sends as many runs more as its
+window has steps, so that every message says all that it can have changed since the one before."""
 
 KEPT_RUNS = 16_384
 """Runs that a node remembers of itself and of each neighbour: some MB at the worst, and what one answer can carry."""
@@ -59,19 +60,31 @@ class History:
             step = self._end(run) + 1
         return None
 
-    def learn(self, step: int, used: UsedSet, earlier: Sequence[Run] = ()) -> int | None:
+    def learn(self, step: int, used: UsedSet, earlier: Sequence[Run] = (), window: int = 0) -> int | None:
         """Take in what a message of `step` says: the set of that step and the runs before it.
 
-        `earlier` is ascending and speaks of every step from its first run's on, to `step` - 1. Returns the
-        first step of which something new is known now, None where nothing is.
+        `earlier` is ascending and speaks of every step from its first run's on, to `step` - 1. A sender that revises
+        may, with each message, have used more in the `window` steps before it: of those that it may have revised
+        since it was last heard, only what this message says is known. Returns the first step of which something else
+        is known now, None where nothing is.
         """
+        if window:
+            if step <= self.last:
+                return None  # what was heard since knows better
+            first, revisable = earlier[0][0] if earlier else step, max(self.born, self.last + 1 - window)
+            if first > revisable:
+                return self.fill(((revisable, None), *earlier, (step, used)), step)
         if step == self.last + 1 and self._is_known(earlier):
             self._append(step, used)
             return step
         return self.fill((*earlier, (step, used)), step)
 
-    def fill(self, told: Sequence[Run], end: int) -> int | None:
-        """Take in ascending runs that speak of every step from the first one's on, to `end`.
+    def says(self, told: Sequence[Run], end: int) -> bool:
+        """Whether what ascending runs say, of every step from the first one's on to `end`, is just what is known."""
+        return self._first_difference(told, end) is None
+
+    def fill(self, told: Sequence[tuple[int, UsedSet | None]], end: int) -> int | None:
+        """Take in ascending runs that speak of every step from the first one's on, to `end`; None: not known any more.
 
         Where they contradict what was known they are right: a node knows best what it used. Returns as `learn`.
         """
@@ -79,15 +92,20 @@ class History:
         if changed is None:
             return None
         start = told[0][0]
-        runs: list[tuple[int, UsedSet | None]] = [(s, u) for s, u in self._runs() if s < start]
-        if start > self.last + 1:
-            runs.append((self.last + 1, None))
+        runs: list[tuple[int, UsedSet | None]] = [(self.last + 1, None)] if start > self.last + 1 else []
         runs.extend(told)
         if end < self.last:
             runs.append((end + 1, self.at(end + 1)))
-            runs.extend((s, u) for s, u in self._runs() if s > end + 1)
-        merged = [run for n, run in enumerate(runs) if n == 0 or run[1] != runs[n - 1][1]][-KEPT_RUNS:]
-        self._starts, self._sets = [s for s, _ in merged], [u for _, u in merged]
+            after = bisect_right(self._starts, end + 1)
+            runs.extend(zip(self._starts[after:], self._sets[after:], strict=True))
+        first = bisect_left(self._starts, start)
+        del self._starts[first:], self._sets[first:]  # nothing before it is looked at: histories may be long
+        for step, used in runs:
+            if not self._sets or self._sets[-1] != used:
+                self._starts.append(step)
+                self._sets.append(used)
+        excess = max(0, len(self._starts) - KEPT_RUNS)
+        del self._starts[:excess], self._sets[:excess]
         self.last = max(self.last, end)
         return changed
 
@@ -108,9 +126,6 @@ class History:
     def _end(self, run: int) -> int:
         return self._starts[run + 1] - 1 if run + 1 < len(self._starts) else self.last
 
-    def _runs(self) -> Iterable[tuple[int, UsedSet | None]]:
-        return zip(self._starts, self._sets, strict=True)
-
     def _is_known(self, told: Sequence[Run]) -> bool:
         """Whether `told` just repeats the last runs, as nearly every message does."""
         first = len(self._starts) - len(told)
@@ -129,7 +144,7 @@ class History:
                 del self._starts[0], self._sets[0]
         self.last = step
 
-    def _first_difference(self, told: Sequence[Run], end: int) -> int | None:
+    def _first_difference(self, told: Sequence[tuple[int, UsedSet | None]], end: int) -> int | None:
         """The first step of [told[0].start, end] where `told` says something else than what is known."""
         for number, (start, used) in enumerate(told):
             stop = told[number + 1][0] if number + 1 < len(told) else end + 1
@@ -137,16 +152,22 @@ class History:
             while step < stop:
                 if self.at(step) != used:
                     return step
+                if step > self.last:
+                    break  # from here on nothing is known, which is what `told` says
                 run = bisect_right(self._starts, step) - 1
                 step = self._end(run) + 1
         return None
 
 
 class Ledger:
-    """What one node knows of the used sets in its neighbourhood, its own included."""
+    """What one node knows of the used sets in its neighbourhood, its own included.
 
-    def __init__(self, own: NodeId, born: int) -> None:
-        self.own = own
+    Where nodes revise what they used up to `window` steps ago, it holds, of each neighbour, what its last message in
+    time was computed with: what that neighbour may have revised since is not what it told before.
+    """
+
+    def __init__(self, own: NodeId, born: int, window: int = 0) -> None:
+        self.own, self._window = own, window
         self._of: dict[NodeId, History] = {own: History(born)}
         self._changed: dict[NodeId, int] = {}
 
@@ -162,15 +183,38 @@ class Ledger:
             self._note(node, born)
         elif history.born > born:
             return  # a former life speaks: its neighbours have begun anew with the present one
-        self._note(node, history.learn(step, used, earlier))
+        self._note(node, history.learn(step, used, earlier, 0 if node == self.own else self._window))
 
     def fill(self, node: NodeId, born: int, end: int, runs: Sequence[Run]) -> bool:
-        """Take in an answer about the present life of `node`; False where it is about another one."""
+        """Take in an answer about the present life of `node`; False where it says nothing that counts.
+
+        An answer is of another moment than the messages: it counts for what was final at that of the last one.
+        """
         history = self._of.get(node)
         if history is None or history.born != born:
             return False
+        if self._window:
+            end = min(end, history.last - self._window)
+            runs = [run for run in runs if run[0] <= end]
+            if not runs:
+                return False
         self._note(node, history.fill(runs, end))
         return True
+
+    def revise(self, step: int, used: UsedSet) -> None:
+        """The node itself has used more at a past step than it had."""
+        self._note(self.own, self._of[self.own].fill([(step, used)], step))
+
+    def agrees(self, node: NodeId, born: int, step: int, used: UsedSet, earlier: Sequence[Run]) -> bool:
+        """Whether what a message of `step` was computed with is, up to that step, what is known of `node` now.
+
+        What it does not speak of was final then: a message speaks of all steps that could still be revised.
+        """
+        history = self._of.get(node)
+        if history is None or history.born != born:
+            return False
+        told = (*earlier, (step, used))
+        return told[0][0] <= max(born, step + 1 - self._window) and history.says(told, step)
 
     def take_changes(self) -> dict[NodeId, int]:
         """For each node of which something new is known since the last call: the first step it concerns."""

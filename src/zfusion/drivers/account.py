@@ -2,34 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import cast
 
+from zfusion.drivers.meters import Meter
 from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report, told_estimate
 from zfusion.drivers.sources import Source
 from zfusion.methods import METHODS, Setting
+from zfusion.methods.protocol import Method
 from zfusion.model.network import Network
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node, Patience
-from zfusion.stages import TRUTH, TRUTH_SENDER, Message
+from zfusion.stages import ARRIVALS, TRUTH, TRUTH_SENDER, Message
+
+MakeMethod = Callable[[Setting], Method]
+"""What a node computes with, made anew for each of its lives."""
 
 
 def make_node(
-    scenario: Scenario, graph: Network, node: NodeId, *, born: int = 1, expected: Collection[NodeId] | None = None
+    scenario: Scenario,
+    graph: Network,
+    node: NodeId,
+    *,
+    born: int = 1,
+    expected: Collection[NodeId] | None = None,
+    method: MakeMethod | None = None,
 ) -> Node:
     """A node of the scenario at the beginning of a life; `graph` is the method's.
 
-    `born` and `expected` as for `Node`. KeyError for a node that is not there.
+    `born` and `expected` as for `Node`; `method` in the place of the scenario's, of the same stages. KeyError for a
+    node that is not there.
     """
-    method = METHODS[scenario.method.name]
+    method = method or METHODS[scenario.method.name]
+    window = scenario.timing.revised_steps
     return Node(
         node,
         graph.neighbours(node),
-        method(Setting(node, scenario.system(), graph, born)),
+        method(Setting(node, scenario.system(), graph, born, window)),
         patience_of(scenario),
         born=born,
         expected=expected,
+        window=window,
     )
 
 
@@ -37,7 +51,7 @@ def patience_of(scenario: Scenario) -> Patience:
     """How long the nodes of the scenario wait: until the stages' deadlines, or so long in each."""
     timing = scenario.timing
     stages = [stage.name for stage in METHODS[scenario.method.name].stages]
-    if timing.period_ns is None:
+    if timing.period_ns is None or timing.late == "wait":
         return Patience((timing.timeout_ns,) * len(stages), paced=False)
     return Patience(tuple(timing.deadline_ns(stage) for stage in stages), paced=True)
 
@@ -50,9 +64,13 @@ def truth_message(x: Array, step: int, seq: int, t_ns: int) -> Message:
 class Account:
     """What is measured of one life of a node, beside what the node itself counts."""
 
-    def __init__(self, node: Node, source: Source, begun_ns: int) -> None:
+    def __init__(
+        self, node: Node, source: Source, begun_ns: int, *, stages: Sequence[str] = (), marked_every: int = 1
+    ) -> None:
+        """`stages` are those whose messages are exchanged; `marked_every` as for `Meter`."""
         self.skipped = 0
         """Steps that it did not take because their time was over."""
+        self.meter = Meter(node.neighbours, stages, marked_every=marked_every)
         self._node, self._source = node, source
         self._begun_ns = begun_ns
         self._errors: dict[str, Errors] = {}
@@ -76,6 +94,14 @@ class Account:
         """A step was completed, so long after its measurement."""
         self._paces[-1].add(now_ns, latency_ns)
 
+    def arrivals(self, now_ns: int, *, ended: bool = False) -> Iterator[Message]:
+        """The messages that tell the latencies measured since the last ones; none most of the time, see `Meter`."""
+        node = self._node
+        for data in self.meter.batch(ended=ended):
+            seq = node.sent[ARRIVALS.name]
+            node.sent[ARRIVALS.name] = seq + 1
+            yield Message(node.id, max(node.step, node.born), ARRIVALS.name, seq, node.born, now_ns, {"data": data})
+
     def report(self) -> NodeReport:
         """What became of it all so far."""
         node, latencies = self._node, Latencies()
@@ -96,9 +122,11 @@ class Account:
             overheard=dict(self._source.counters),
             estimate=told_estimate(node),
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},
+            measured=self.meter.told(),
         )
 
     def last_words(self) -> dict[str, object]:
         """What a node tells when it leaves."""
         report = self.report()
-        return {"sent": report.sent, "edges": report.edges, "completed": report.completed, "skipped": report.skipped}
+        counted = {"sent": report.sent, "edges": report.edges, "completed": report.completed, "skipped": report.skipped}
+        return {**counted, "budget": self.meter.budgets()}

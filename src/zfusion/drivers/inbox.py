@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
@@ -19,7 +18,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 
+from zfusion.drivers.clocks import Clock
+from zfusion.drivers.transport import on_zenoh_thread
+
 Channel = TypeVar("Channel", bound=Hashable)
+
+Letter = tuple[bytes, int, int | None]
+"""(payload, when it was looked at, when it had come to this machine: known where its sender asked for that stamp)."""
 
 CHANNEL = 16_384
 """Messages of one key that wait here; beyond that they wait in the sockets, and then at the sender. Room for what a
@@ -28,6 +33,9 @@ swarm says while one of its nodes, just restarted, gets ready to follow it."""
 STRETCH_NS = 10_000_000
 """How long a wait may go on before it is ended so that the other channels can be looked into: far longer than the waits
 of a swarm in step, far shorter than deadlines of seconds."""
+
+POSTED = 65_536
+"""Messages that wait where they do not wait in channels; beyond it they are dropped, and counted."""
 
 NEVER = 2**63
 """Later than every time on the clock, in nanoseconds."""
@@ -63,13 +71,21 @@ class _Wait(NamedTuple):
 class Inbox:
     """The channels of a node, and its alarm clock. For one thread; `notify` is for all."""
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, clock: Clock | None = None) -> None:
+        """All times are `clock`'s; by default the machine's."""
         self.notices: deque[Any] = deque()
         """What happened besides messages, in order; filled by `notify` from any thread."""
+        self.posted: deque[tuple[Any, bytes, int]] = deque()
+        """(source, payload, time) of what came from sources that are not read one by one, in the order of coming."""
+        self.overrun = 0
+        """What came from them and was dropped, being too much."""
         self._session = session
+        self._clock = clock or Clock()
+        self._now = self._clock.now
         self._channels: dict[Hashable, Any] = {}
         self._keys: dict[Hashable, str] = {}
         self._bell = os.urandom(16)
+        self._posters: list[Any] = []
         self._bells: list[threading.Thread] = []
         """That may still be ringing."""
         self._wait: _Wait | None = None
@@ -86,25 +102,35 @@ class Inbox:
         self._channels[source] = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(capacity))
         self._keys[source] = bell or key
 
-    def poll(self, source: Hashable) -> bytes | None:
+    def subscribe_posted(self, source: Hashable, key: str) -> None:
+        """Have what is published on `key` go to `posted` as it comes."""
+
+        def post(sample: Any) -> None:
+            data = sample.payload.to_bytes()
+            if len(self.posted) < POSTED:
+                self.posted.append((source, data, self._now()))
+                self._alarm.set()
+            else:
+                self.overrun += 1
+
+        self._posters.append(self._session.declare_subscriber(key, on_zenoh_thread(post)))
+
+    def poll(self, source: Hashable) -> Letter | None:
         """The next message, if there is one."""
         while (sample := self.poll_sample(source)) is not None:
-            data: bytes = sample.payload.to_bytes()
-            if data != self._bell:
-                return data
+            letter = self._letter(sample)
+            if letter is not None:
+                return letter
         return None
 
     def poll_sample(self, source: Hashable) -> Any | None:
         """The next message as Zenoh gives it, which may be the bell, if there is one."""
         return self._channels[source].handler.try_recv()
 
-    def wait(self, source: Hashable, deadline_ns: int | None) -> bytes | None:
-        """The next message; None when the deadline has passed (wall clock), there is a notice, or for a change."""
+    def wait(self, source: Hashable, deadline_ns: int | None) -> Letter | None:
+        """The next message; None when the deadline has passed, there is a notice, or for a change."""
         sample = self.wait_sample(source, deadline_ns)
-        if sample is None:
-            return None
-        data: bytes = sample.payload.to_bytes()
-        return None if data == self._bell else data
+        return None if sample is None else self._letter(sample)
 
     def wait_sample(self, source: Hashable, deadline_ns: int | None) -> Any | None:
         """The next message as Zenoh gives it, which may be the bell; None where there is a notice already."""
@@ -119,10 +145,10 @@ class Inbox:
             self._wait = None
         return sample
 
-    def rest(self, until_ns: int) -> bool:
-        """Sleep until a time (wall clock); False if there is a notice before."""
-        while not self.notices:
-            left_ns = until_ns - time.time_ns()
+    def rest(self, until_ns: int, *, or_posted: bool = False) -> bool:
+        """Sleep until a time; False if there is a notice before or, where that is asked for, something is posted."""
+        while not self.notices and not (or_posted and self.posted):
+            left_ns = until_ns - self._now()
             if left_ns <= 0:
                 return True
             self._alarm.wait(left_ns / 1e9)
@@ -134,27 +160,42 @@ class Inbox:
         self._alarm.set()
         self._nudge.set()
 
-    def drain(self, sources: Iterable[Channel], take: Callable[[Channel, bytes], None]) -> None:
+    def drain(self, sources: Iterable[Channel], take: Callable[[Channel, Letter], None]) -> None:
         """Take all that has arrived from the given sources."""
         for source in sources:
-            while (data := self.poll(source)) is not None:
-                take(source, data)
+            while (letter := self.poll(source)) is not None:
+                take(source, letter)
 
     def close(self) -> None:
         """Stop receiving; what is still in the channels is dropped."""
         self._open = False
         self._nudge.set()
         self._watcher.join()
-        for channel in self._channels.values():
+        for channel in (*self._channels.values(), *self._posters):
             channel.undeclare()  # a session with a full channel would not close
         for bell in self._bells:
             bell.join()  # a session that is being used would not, either
+
+    def _letter(self, sample: Any) -> Letter | None:
+        """What is in a sample; None for the bell."""
+        data: bytes = sample.payload.to_bytes()
+        if data == self._bell:
+            return None
+        stack = sample.timestamp_stack
+        return data, self._now(), None if stack is None else self._received(stack)
+
+    def _received(self, stack: Any) -> int | None:
+        for record in stack.records:
+            if record.point == zenoh.InterceptionPoint.RECEIVE:
+                stamp: int = record.timestamp().get_time_as_ntp64().as_nanos()
+                return stamp + self._clock.ahead_ns
+        return None
 
     def _watch(self) -> None:
         seen = rung = None
         while self._open:
             self._wakes_ns = NEVER  # first of all, so that a wait that begins now does not rely on this look
-            wait, now = self._wait, time.time_ns()
+            wait, now = self._wait, self._now()
             if wait is None:
                 self._nudge.wait(threading.TIMEOUT_MAX)
                 continue

@@ -19,21 +19,26 @@ from itertools import count
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
+from zfusion.drivers.clocks import Clock, WrongClock, machine
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.key_source import KeySource
 from zfusion.drivers.meeting import Start
+from zfusion.drivers.meters import MARKED_EVERY
 from zfusion.drivers.metrics import NodeReport, told_estimate
+from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import open_session, publisher
-from zfusion.errors import InputError, MessageError
+from zfusion.drivers.transport import RECEIPT, open_session, publisher
+from zfusion.errors import InputError
+from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
 from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
-from zfusion.stages import ESTIMATE, EVENT, TRUTH, Message
+from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
 from zfusion.status import Phase, Status
 
 REPORT_NS = 250_000_000
@@ -43,11 +48,11 @@ AHEAD = 65_536
 """Messages kept here that are too far ahead for the node to take: what a swarm says in half a minute, while a node that
 was restarted follows it."""
 
+MOST_HELD = 16
+"""Messages of a neighbour that is gone, held by its link, that are told: an event is of bounded size."""
+
 GARBAGE_THRESHOLD = 100_000
 """Allocations between two garbage collections. A round makes no cycles; a collection costs as much as a round."""
-
-Channel = tuple[NodeId, str]
-"""(neighbour, stage)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +67,8 @@ class LiveOptions:
     """When step 0 is; by default what the scenario says, or what the swarm agrees on."""
     steps: int | None = None
     """Last step; None: until told to stop."""
+    emulate: bool = True
+    """Whether the node is to do to its neighbours' messages what the scenario's links say; False: the network does."""
 
 
 class LiveNode:
@@ -73,10 +80,12 @@ class LiveNode:
         node: NodeId,
         options: LiveOptions,
         tell: Callable[[Status], None] | None = None,
+        announce: Callable[[Blow], None] | None = None,
     ) -> None:
-        """`tell` is called with the node's status a few times a second.
+        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before.
 
-        Raises InputError where Zenoh does not open, or the sensor's source.
+        Raises InputError where Zenoh does not open, or the sensor's source or a link's, and for a plan that stops the
+        node where nobody is there to set it going again.
         """
         self.id = node
         self._scenario, self._options, self._tell = scenario, options, tell
@@ -86,14 +95,20 @@ class LiveNode:
         self.node: Node | None = None
         self.stopping = False
         self._account: Account | None = None
-        self._decoders: dict[Channel, Decoder] = {}
-        self._ahead: list[tuple[int, int, Channel, bytes, Message]] = []
+        self._ahead: list[tuple[int, int, Heard]] = []
+        self._most_ahead = 0
         self._order = count()
-        self._last_heard: dict[Channel, bytes] = {}
+        self._last_heard: dict[tuple[NodeId, str], bytes] = {}
+        self._stamped = False
+        """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
         self._told_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
+        self._patient = scenario.timing.late == "wait"
+        """Whether a paced step begins late, if it has to, rather than not at all."""
+        self._misfortune = Misfortune(scenario, node, announce)
+        link = links_of(scenario) if options.emulate else ideal
         config = scenario.transport.zenoh_config
         self._session = open_session(
             options.endpoints,
@@ -105,10 +120,20 @@ class LiveNode:
         except InputError:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
-        self._inbox = Inbox(self._session)
+        self._clock = WrongClock() if self._misfortune.clock_goes_wrong else Clock()
+        self._now = self._clock.now
+        self._inbox = Inbox(self._session, self._clock)
+        self._links = link if isinstance(link, LinkNetwork) else None
+        self._hearing = Hearing(self._inbox, self)
+        if self._links is not None:
+            self._hearing = EmulatedHearing(
+                self._inbox, self, node, self._links, self._misfortune.timeline, self._clock
+            )
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
-        self._presence = Presence(self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox)
+        self._presence = Presence(
+            self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock
+        )
 
     def run(self) -> NodeReport:
         """Join, take the steps, leave; what became of it all.
@@ -127,7 +152,7 @@ class LiveNode:
                 self._inbox.close()
                 self._source.close()
                 self._presence.close()
-        return self._report()
+        return self.report()
 
     def stop(self) -> None:
         """End after what is being done now: at the latest at the next message or deadline."""
@@ -148,17 +173,25 @@ class LiveNode:
             completed=node.completed if node else 0,
             fallbacks=node.fallbacks if node else 0,
             estimate=told_estimate(node) if node else {},
+            machine=None if self._misfortune.clock_goes_wrong else machine(),
         )
 
-    def _report(self) -> NodeReport:
+    def report(self) -> NodeReport:
+        """How it has gone so far."""
         node, account = self.node, self._account
         if node is None or account is None:
             return NodeReport.of_nothing(self.id)
-        while self._ahead:
-            *_, message = heappop(self._ahead)
-            node.counters[message.node].refused["too_early"] += 1
         report = account.report()
+        for *_, heard in self._ahead:
+            refused = report.edges[str(heard.message.node)]["refused"]
+            refused["too_early"] = refused.get("too_early", 0) + 1
         report.overheard = dict(Counter(report.overheard) + self._presence.overheard)
+        if self._inbox.overrun:
+            report.overheard["overrun"] = self._inbox.overrun
+        report.clocks = {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+        report.queues = {"ahead": self._most_ahead, "held": self._hearing.most_held}
+        if self._links is not None:
+            report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
         return report
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
@@ -169,7 +202,8 @@ class LiveNode:
         """Publishers and subscribers, and then: be there."""
         run, session, system = self._options.run, self._session, self._scenario.system()
         stages = [stage.name for stage in self._method.stages]
-        published = (*stages, ESTIMATE.name, EVENT.name)
+        published = (*stages, *(stage.name for stage in (ESTIMATE, EVENT, ARRIVALS, REVISED)))
+        self._timed = {*stages, ESTIMATE.name}
         self._publish = {stage: publisher(session, keys.stage_key(run, self.id, stage)).put for stage in published}
         self._tells_truth = self._scenario.truth_known and self.id == self._graph.ids[0]
         if self._tells_truth:
@@ -177,8 +211,8 @@ class LiveNode:
         for j in sorted(self._meeting.hears, key=self._graph.ids.index):
             sizes = {"nx": system.nx, "ny": system.by_id[j].ny}
             for stage in self._method.stages:
-                self._decoders[j, stage.name] = Decoder(stage, j, sizes=sizes, ids=self._graph.neighbours(j))
-                self._inbox.subscribe((j, stage.name), keys.stage_key(run, j, stage.name))
+                decoder = Decoder(stage, j, sizes=sizes, ids=self._graph.neighbours(j))
+                self._hearing.subscribe((j, stage.name), keys.stage_key(run, j, stage.name), decoder)
         self._presence.declare()
 
     def _begin(self, start: Start) -> Node:
@@ -190,9 +224,12 @@ class LiveNode:
         gc.collect()
         gc.freeze()
         gc.set_threshold(GARBAGE_THRESHOLD)
-        now, period = time.time_ns(), self._period_ns
+        now, period = self._now(), self._period_ns
         first = max(now, start.epoch_ns + start.born * period) if period else now
-        self.node, self._account, self.phase = node, Account(node, self._source, first), Phase.RUNNING
+        exchanged = [stage.name for stage in self._method.stages]
+        every = MARKED_EVERY if not period and self._hearing.stamped else 1
+        self.node, self.phase = node, Phase.RUNNING
+        self._account = Account(node, self._source, first, stages=exchanged, marked_every=every)
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
         self.tell_status()
         return node
@@ -205,9 +242,16 @@ class LiveNode:
         step = start.born
         while not self.stopping and (last is None or step <= last):
             due = None
+            if (
+                self._inbox.notices
+            ):  # who finds all messages there, being behind, never waits: and must still see to them
+                self._presence.handle_notices()
             if period:
+                self._clock.set_ahead(self._misfortune.clock_ns(step))
                 due = self._await_due(start.epoch_ns + step * period)
-                skipped = (time.time_ns() - due) // period  # its whole period is over
+            self._suffer(node, step, start.epoch_ns)
+            if due is not None and not self._patient:
+                skipped = (self._now() - due) // period  # its whole period is over
                 if skipped > 0 and not self.stopping:
                     skipped = skipped if last is None else min(skipped, last + 1 - step)
                     account.skipped += skipped
@@ -215,35 +259,52 @@ class LiveNode:
                     continue
             if middle is not None and step >= middle:
                 middle = None
-                account.settle(time.time_ns())
+                account.settle(self._now())
             self._take_step(node, account, step, due)
             step += 1
 
     def _await_due(self, due: int) -> int:
         """Sleep until a paced step is due; then take what has come meanwhile."""
-        while not self.stopping and not self._inbox.rest(due):
+        while not self.stopping and not self._hearing.rest(due):
             self._presence.handle_notices()
-        self._inbox.drain(self._decoders, self._take)
+            self._hearing.drain(until_ns=due)  # what comes later is looked at when the step has begun: it may be late
+        self._hearing.drain(until_ns=due)
         return due
+
+    def _suffer(self, node: Node, step: int, epoch_ns: int) -> None:
+        """What is planned to happen to this node when it is to begin the step."""
+        if not self._misfortune or self.stopping:
+            return
+        for data in self._misfortune.news(node.born, step):
+            self._carry_out([node.event("fault", self._now(), **data)])
+        if self._misfortune.kills(node.born, step):
+            self._tell_arrivals(ended=True)
+        self._misfortune.strike(node.born, step, epoch_ns)
 
     def _take_step(self, node: Node, account: Account, step: int, due: int | None) -> None:
         if self.stopping:
             return
-        y = self._source.read(step, time.time_ns() if due is None else due)
-        began, now = time.perf_counter_ns(), time.time_ns()
+        y = self._source.read(step, self._now() if due is None else due)
+        began, now = time.perf_counter_ns(), self._now()
         if self._tells_truth:
             self._tell_truth(node, step, now)
-        self._carry_out(node.begin(step, y, now, due))
+        meter = account.meter
+        meter.begin(step, now)
+        self._stamped = self._hearing.stamped and meter.marks(step)
+        # However late it begins: what has come in time is to be looked at before the first deadline counts.
+        self._carry_out(node.begin(step, y, now if due is None else due, due))
         if self._ahead:
             self._catch_up(node)
         for j in node.silent:
-            self._inbox.drain([channel for channel in self._decoders if channel[0] == j], self._take)
+            self._hearing.drain(j)
         while (stage := node.stage) is not None and not self.stopping:
             self._await_messages(node, stage)
         if node.stage is None:
             latency = time.perf_counter_ns() - began
-            now = time.time_ns()
+            now = self._now()
+            meter.finish()
             account.complete(now if due is None else max(now, due + self._period_ns), latency)
+            self._tell_arrivals()
             if now - self._told_ns > REPORT_NS:
                 self.tell_status()
         for estimate in self._estimates:
@@ -251,61 +312,88 @@ class LiveNode:
         self._estimates.clear()
 
     def _await_messages(self, node: Node, stage: str) -> None:
-        """Wait for the messages of a stage, the deadline or a notice, and act on it.
-
-        The messages are taken together when the last is there: to wait and to work in turns costs more than both.
-        """
-        awaiting, came = node.awaiting, []
-        for j in awaiting:
-            data = self._inbox.wait((j, stage), node.deadline)
-            if data is None:
-                break
-            came.append(((j, stage), data))
-        for channel, data in came:
-            self._take(channel, data)
-        if len(came) == len(awaiting):
+        """Wait for the messages of a stage, the deadline or a notice, and act on it."""
+        if self._hearing.wait(node, stage):
             return
         self._presence.handle_notices()
-        overdue = node.deadline is not None and time.time_ns() >= node.deadline
+        deadline, now = node.deadline, self._now()
         # What stands in the channels has arrived in time, it was only not looked at yet; and none must run full.
-        self._inbox.drain(self._decoders, self._take)
-        if overdue:
-            self._carry_out(node.tick(time.time_ns()))
+        self._hearing.drain()
+        if deadline is not None and now >= deadline and node.deadline == deadline:
+            self.let_close(now)
 
-    def _take(self, channel: Channel, data: bytes) -> None:
-        """Feed the node a message; what is not one is counted."""
-        node = self.node
+    def let_close(self, now_ns: int) -> None:
+        """The deadline of the present stage has passed, and all that came in time is taken."""
+        node, account = self.node, self._account
+        if node is None or account is None or node.deadline is None:
+            return
+        account.meter.there(now_ns)
+        # With steps that have times only what is over at that deadline: of a later stage, more may be in time still.
+        self._carry_out(node.tick(node.deadline if self._period_ns else now_ns))
+
+    def hear(self, heard: Heard) -> None:
+        """A neighbour's message is there."""
+        node, message = self.node, heard.message
         if node is None:
             return
-        try:
-            message = self._decoders[channel].decode(data)
-        except MessageError as error:
-            node.counters[channel[0]].refused[error.reason] += 1
-            return
-        if channel[0] in self._presence.strangers:
-            node.counters[channel[0]].refused["other_scenario"] += 1
+        if message.node in self._presence.strangers:
+            node.counters[message.node].refused["other_scenario"] += 1
         elif message.step > node.step + LOOKAHEAD and len(self._ahead) < AHEAD:
-            heappush(self._ahead, (message.step, next(self._order), channel, data, message))
+            heappush(self._ahead, (message.step, next(self._order), heard))
+            self._most_ahead = max(self._most_ahead, len(self._ahead))
         else:
-            if message.step >= node.step:
-                self._last_heard[channel] = data
-            self._carry_out(node.receive(message, time.time_ns()))
+            self._feed(node, heard)
+
+    def _feed(self, node: Node, heard: Heard) -> None:
+        """Give the node a message, which is in time until the driver says that time is up."""
+        channel, data, message, looked_ns, received_ns, due_ns = heard
+        if message.step >= node.step:
+            self._last_heard[channel] = data
+        account, taken, now = self._account, node.taken, self._now()
+        assert account is not None  # it is there as long as the node is
+        account.meter.there(looked_ns)
+        if node.deadline is not None and now >= node.deadline:
+            now = node.deadline - 1
+        effects = node.receive(message, now)
+        if node.taken != taken:
+            account.meter.took(message, looked_ns, received_ns, due_ns)
+        self._carry_out(effects)
 
     def _catch_up(self, node: Node) -> None:
         """Feed the node what was too far ahead of it and is not any more."""
         while self._ahead and self._ahead[0][0] <= node.step + LOOKAHEAD:
-            _, _, channel, data, message = heappop(self._ahead)
-            self._last_heard[channel] = data
-            self._carry_out(node.receive(message, time.time_ns()))
+            self._feed(node, heappop(self._ahead)[2])
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, Ask):
                 self._presence.ask_history(effect.node)
                 continue
-            self._publish[effect.stage](encode(effect))
+            stage = effect.stage
+            if stage in self._timed:
+                self._put(effect)
+            else:
+                self._publish[stage](encode(effect))
             if "x" in effect.fields:
                 self._estimates.append(effect)
+
+    def _put(self, message: Message) -> None:
+        """Publish a message of a step, with the time at which that is done."""
+        assert self._account is not None  # steps are taken with one
+        if self._misfortune and (slow_s := self._misfortune.slow_s(message.step)):
+            time.sleep(slow_s)
+        now = self._now()
+        self._account.meter.put(now)
+        if self._stamped and message.stage != ESTIMATE.name:
+            self._publish[message.stage](encode(message, now), timestamp_instrumentation=RECEIPT)
+        else:
+            self._publish[message.stage](encode(message, now))
+
+    def _tell_arrivals(self, *, ended: bool = False) -> None:
+        """Tell what was measured of the neighbours' messages, when it is time to."""
+        assert self._account is not None  # steps are taken with one
+        for message in self._account.arrivals(self._now(), ended=ended):
+            self._publish[ARRIVALS.name](encode(message))
 
     def _tell_truth(self, node: Node, step: int, now: int) -> None:
         x = self._source.truth(step)
@@ -322,15 +410,18 @@ class LiveNode:
         node = self.node
         if node is None:
             return
-        channels = [channel for channel in self._decoders if channel[0] == j]
-        self._inbox.drain(channels, self._take)
-        last = [decode_any(self._last_heard[channel]) for channel in channels if channel in self._last_heard]
-        now = time.time_ns()
+        self._hearing.drain(j)
+        heard = [self._last_heard[channel] for channel in self._hearing.channels(j) if channel in self._last_heard]
+        last = [decode_any(data) for data in (*heard, *self._hearing.held(j)[:MOST_HELD])]
+        now = self._now()
+        if self._account is not None:
+            self._account.meter.there(now)
         self._carry_out([node.event("gone", now, of=j, last=last), *node.gone(j, now)])
 
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
-        self._told_ns = time.time_ns()
+        self._told_ns = self._now()
+        self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())
 
@@ -338,7 +429,8 @@ class LiveNode:
         """Tell how it went, and see that everybody has heard everything."""
         assert self._account is not None  # `_begin` has made it
         self.phase = Phase.DONE
-        self._carry_out([node.event("stopped", time.time_ns(), **self._account.last_words())])
+        self._tell_arrivals(ended=True)
+        self._carry_out([node.event("stopped", self._now(), **self._account.last_words())])
         self.tell_status()
         self._presence.take_leave()
-        self._inbox.drain(self._decoders, self._take)
+        self._hearing.end()

@@ -72,6 +72,12 @@ class Life:
         """The last step that was lived again."""
         self.told: dict[int, list[tuple[NodeId, HistoryAnswer]]] = {}
         """By step: histories that were asked for."""
+        self.taken: dict[tuple[int, str], list[tuple[int, tuple[NodeId, ...]]]] = {}
+        """By step and stage: of which past steps whose messages came late and were taken in."""
+        self.corrections: dict[tuple[int, int], Message] = {}
+        """By the step at which they were made, and their own: corrected estimates that were told, not compared yet."""
+        self.corrected: dict[tuple[int, int], Message] = {}
+        """Likewise: those that came out when their time was lived again, and were not compared yet."""
         self.over = False
         """It was lived again to its end: a message that comes only now comes too late."""
         self.awaits: Place | None = None

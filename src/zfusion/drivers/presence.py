@@ -11,16 +11,18 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock, ClockOffset
 from zfusion.drivers.endpoints import linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
-from zfusion.drivers.transport import on_zenoh_thread
+from zfusion.drivers.transport import never_linger, on_zenoh_thread
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Reason, decode_any, encode_any
 from zfusion.model.network import Network
@@ -81,8 +83,10 @@ class Presence:
         run: str,
         session: zenoh.Session,
         inbox: Inbox,
+        clock: Clock,
     ) -> None:
         self.meeting = meeting
+        self._now = clock.now
         self.overheard: Counter[str] = Counter()
         """What came and was neither a question nor an answer, by reason."""
         self.strangers: set[NodeId] = set()
@@ -96,6 +100,9 @@ class Presence:
         self._answered: set[NodeId] = set()
         """Who was told how this node is doing."""
         self._kept: list[Any] = []
+        self.clocks = {j: ClockOffset() for j in meeting.linked}
+        """How far the neighbours' clocks are ahead of this node's."""
+        self._read_clocks_ns = 0
 
     def declare(self) -> None:
         """Be there. To be done when everything is subscribed: whoever sees the token is heard."""
@@ -111,7 +118,7 @@ class Presence:
 
     def join(self) -> Start | None:
         """Wait until it is time to begin; None if stopped before. InputError where somebody runs something else."""
-        next_poll = time.time_ns()
+        next_poll = self._now()
         next_word = next_poll + WORD_NS
         while not self._host.stopping:
             try:
@@ -119,7 +126,7 @@ class Presence:
             except InputError:
                 self._be_refused()
                 raise
-            now = time.time_ns()
+            now = self._now()
             start = self.meeting.start(now)
             if start is not None:
                 return start
@@ -147,16 +154,24 @@ class Presence:
         if self.meeting.recorder:
             self._unconfirmed.add(RECORDER)
             self._query(keys.recorder_status_key(self._run), "recorder!", RECORDER)
-        end = time.time_ns() + LEAVE_NS
-        while (self._unconfirmed or self._somebody_speaks()) and time.time_ns() < end:
+        end = self._now() + LEAVE_NS
+        while (self._unconfirmed or self._somebody_speaks()) and self._now() < end:
             self._inbox.rest(end)
             self.handle_notices()
 
     def close(self) -> None:
         """Answer nothing any more."""
-        for kind, about in filter(None, self._inbox.notices):
+        for kind, about, _ in filter(None, self._inbox.notices):
             if kind in QUESTIONS:
                 about.drop()
+
+    def read_clocks(self, now_ns: int) -> None:
+        """Ask the neighbours on other machines for the time, if it is time to."""
+        if now_ns >= self._read_clocks_ns:
+            self._read_clocks_ns = now_ns + ASK_AGAIN_NS
+            for j, clock in self.clocks.items():
+                if j in self.meeting.present and not clock.same_machine:
+                    self._ask_status(j)
 
     def ask_history(self, j: NodeId) -> None:
         """Ask a neighbour what it used; the node is told what it answers."""
@@ -169,9 +184,9 @@ class Presence:
             notice = notices.popleft()
             if notice is None:
                 continue
-            kind, about = notice
+            kind, about, at_ns = notice
             try:
-                self._handlers[kind](self, about)
+                self._handlers[kind](self, about, at_ns)
             except MessageError as error:
                 self.overheard[error.reason] += 1
 
@@ -182,13 +197,14 @@ class Presence:
         if kind in QUESTIONS and len(self._inbox.notices) >= MAX_NOTICES:
             about.drop()
         else:
-            self._inbox.notify((kind, about))
+            self._inbox.notify((kind, about, self._now()))
 
     def _query(self, key: str, kind: str, about: NodeId) -> None:
-        """Ask, and say who asks and whether it is leaving; the answer comes as a notice."""
+        """Ask, and say who asks and whether it is leaving; the answer comes as a notice, with the times of both."""
+        asked_ns = self._now()
         self._session.get(
             key,
-            on_zenoh_thread(lambda reply: self._note(kind, (about, reply))),
+            on_zenoh_thread(lambda reply: self._note(kind, (about, reply, asked_ns))),
             payload=encode_any({"from": self.meeting.own, "leaving": self._host.phase is Phase.DONE}),
             timeout=ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -199,8 +215,8 @@ class Presence:
 
     def _be_refused(self) -> None:
         """Stay until those who are there have been told, too, what this node runs: they are to say so themselves."""
-        end = time.time_ns() + int(ANSWER_S * 1e9)
-        while not self._host.stopping and not self.meeting.present <= self._answered and time.time_ns() < end:
+        end = self._now() + int(ANSWER_S * 1e9)
+        while not self._host.stopping and not self.meeting.present <= self._answered and self._now() < end:
             self._inbox.rest(end)
             with suppress(InputError):
                 self.handle_notices()
@@ -210,7 +226,7 @@ class Presence:
         meeting = self.meeting
         return not self._host.stopping and not meeting.hears & meeting.present <= self._leaving
 
-    def _on_token(self, sample: Any) -> None:
+    def _on_token(self, sample: Any, _at_ns: int) -> None:
         text = keys.parse_token(str(sample.key_expr)).node or ""
         try:
             j = self._scenario.node_id(text)
@@ -225,20 +241,21 @@ class Presence:
             if self._host.phase is Phase.RUNNING and j in self.meeting.hears:
                 self._host.part_with(j)
             return
+        never_linger()  # there may be a new link
         self.meeting.came(j)
         if self._host.node is not None:
             self._ask_status(j)
 
-    def _on_recorder(self, sample: Any) -> None:
+    def _on_recorder(self, sample: Any, _at_ns: int) -> None:
         self.meeting.recorder = sample.kind == zenoh.SampleKind.PUT
         if not self.meeting.recorder:
             self._unconfirmed.discard(RECORDER)
 
-    def _on_recorder_status(self, about: tuple[NodeId, Any]) -> None:
+    def _on_recorder_status(self, about: tuple[NodeId, Any, int], _at_ns: int) -> None:
         if about[1].ok is not None:
             self._unconfirmed.discard(RECORDER)
 
-    def _on_status(self, about: tuple[NodeId, Any]) -> None:
+    def _on_status(self, about: tuple[NodeId, Any, int], at_ns: int) -> None:
         j, reply, node = about[0], about[1].ok, self._host.node
         if reply is None:
             if node is not None and j in self.meeting.present:
@@ -248,6 +265,7 @@ class Presence:
         if status.node != j:
             raise MessageError(Reason.WRONG_NODE, f"{status.node} answers for {j}")
         self._unconfirmed.discard(j)
+        self._read_clock(status, about[2], at_ns)
         if node is None:
             self.meeting.answered(status)
             return
@@ -261,32 +279,39 @@ class Presence:
         if j in self.meeting.hears and j in self.meeting.present and status.phase is not Phase.DONE:
             node.back(j)
 
-    def _on_history(self, about: tuple[NodeId, Any]) -> None:
+    def _read_clock(self, status: Status, asked_ns: int, answered_ns: int) -> None:
+        """What an answer tells of its sender's clock."""
+        clock, own = self.clocks.get(status.node), self._host.status().machine
+        if clock is not None:
+            clock.same_machine = own is not None and status.machine == own
+            clock.read(asked_ns, status.heard_ns, status.told_ns, answered_ns)
+
+    def _on_history(self, about: tuple[NodeId, Any, int], _at_ns: int) -> None:
         of, reply, node = about[0], about[1].ok, self._host.node
         if reply is None or node is None:
             return
         answer = HistoryAnswer.decode(reply.payload.to_bytes(), frozenset(self._graph.neighbours(of)))
         node.learn_history(of, answer.born, answer.end, answer.runs)
 
-    def _answer_status(self, query: Any) -> None:
+    def _answer_status(self, query: Any, at_ns: int) -> None:
         with query:
             question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
-            query.reply(keys.status_key(self._run, self.meeting.own), self._host.status().encode())
+            status = replace(self._host.status(), heard_ns=at_ns, told_ns=self._now())
+            query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
             asker = question.get("from")
             if isinstance(asker, int | str):
                 self._answered.add(asker)
                 if question.get("leaving"):
                     self._leaving.add(asker)
 
-    def _answer_history(self, query: Any) -> None:
+    def _answer_history(self, query: Any, _at_ns: int) -> None:
         with query:
             node = self._host.node
-            own = node.ledger.of(self.meeting.own) if node is not None else None
-            if node is not None and own is not None:
-                answer = HistoryAnswer(node.born, own.last, own.runs(own.last))
+            if node is not None:
+                answer = HistoryAnswer(*node.tell_history())
                 query.reply(keys.history_key(self._run, self.meeting.own), answer.encode())
 
-    _handlers: ClassVar[dict[str, Callable[[Presence, Any], None]]] = {
+    _handlers: ClassVar[dict[str, Callable[[Presence, Any, int], None]]] = {
         "token": _on_token,
         "recorder": _on_recorder,
         "status!": _on_status,

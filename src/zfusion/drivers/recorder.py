@@ -19,14 +19,14 @@ from zfusion import keys
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
-from zfusion.drivers.transport import on_zenoh_thread, open_session
+from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
 from zfusion.methods import METHODS
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording.writer import RecordingWriter
-from zfusion.stages import ESTIMATE, EVENT, TRUTH, TRUTH_SENDER, Stage
+from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, TRUTH_SENDER, Stage
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
@@ -225,6 +225,7 @@ class Recorder:
         if node not in self._ids:
             return
         if sample.kind == zenoh.SampleKind.PUT:
+            never_linger()  # there is a new link
             self._seen.add(node)
             self._present.add(node)
         else:
@@ -238,6 +239,7 @@ class Recorder:
 
 def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:
     """All keys that a run can have, by themselves."""
-    stages = (*METHODS[scenario.method.name].stages, ESTIMATE, EVENT)
+    corrected = (REVISED,) if scenario.timing.revised_steps else ()
+    stages = (*METHODS[scenario.method.name].stages, *corrected, ESTIMATE, EVENT, ARRIVALS)
     topics = {keys.stage_key(run, i, stage.name): _Topic(i, stage) for i in scenario.ids for stage in stages}
     return topics | {keys.truth_key(run): _Topic(None, TRUTH)}

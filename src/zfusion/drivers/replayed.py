@@ -10,6 +10,8 @@ of the same making that is fed just these, step by step, and what it says is com
     neighbours' measurements           those in `used` of its intermediate       its intermediate
     neighbours' intermediates          those in `used`, `excluded` of estimate   its estimate
     its events "history"               to `learn_history`, before the estimate
+    its events "revised"               the late messages that they name       its corrected estimates
+                                       before the stage that they name ends
 
 The node is given one neighbour more than it has, of which nothing is ever heard: so it goes on when told to, and not
 before. Messages are taken as they come and forgotten when nobody needs them any more.
@@ -17,13 +19,13 @@ before. Messages are taken as they come and forgotten when nobody needs them any
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import repeat
 from multiprocessing import get_context
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import cast
 
@@ -35,13 +37,13 @@ from zfusion.drivers.verdict import NAMED, TOLERANCE, Difference, Tally, Verdict
 from zfusion.errors import InputError, MessageError
 from zfusion.gaps import MAX_LIVES
 from zfusion.messages import Decoder, Reason, encode_any
-from zfusion.methods import METHODS, Setting
+from zfusion.methods import METHODS, Fields, Setting
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
-from zfusion.node import Effect, Node, Patience
+from zfusion.node import Node, Patience
 from zfusion.recording.provenance import arithmetic_differences
 from zfusion.recording.reader import Recording
-from zfusion.stages import ESTIMATE, EVENT, MEASUREMENT, Message
+from zfusion.stages import ESTIMATE, EVENT, MEASUREMENT, REVISED, Message
 from zfusion.status import HistoryAnswer
 
 WAIT_STEPS = 2048
@@ -84,10 +86,12 @@ class _Verifier:
         self._scenario, self._complete, self._tolerance = scenario, complete, tolerance
         self._method = METHODS[scenario.method.name]
         self._graph = self._method.network(scenario.network)
-        self._tables = {stage.name: stage for stage in (*self._method.stages, ESTIMATE, EVENT)}
+        self._tables = {stage.name: stage for stage in (*self._method.stages, ESTIMATE, REVISED, EVENT)}
         self._stages = [stage.name for stage in self._method.stages]
         self._published = [*self._stages, ESTIMATE.name]
-        self._order = {stage: number for number, stage in enumerate(self._published)}
+        self._order = {stage: number for number, stage in enumerate((*self._published, REVISED.name))}
+        self._window = scenario.timing.revised_steps
+        self._takers = {EVENT.name: self._take_event, REVISED.name: self._take_correction}
         self._nobody = _another_id(self._graph.ids)
         self._heard = {j for node in nodes for j in self._graph.neighbours(node)}
         """The nodes themselves, and those whose messages are their inputs."""
@@ -108,8 +112,10 @@ class _Verifier:
             return None
         if key.stage not in self._tables or (node not in self._heard and key.stage != EVENT.name):
             return None
+        if key.stage == REVISED.name and node not in self._done:
+            return None
         decode = self._decoder(node, key.stage).decode
-        take = self._take_event if key.stage == EVENT.name else self._take_message
+        take = self._takers.get(key.stage, self._take_message)
 
         def decode_and_take(data: bytes) -> None:
             try:
@@ -125,6 +131,7 @@ class _Verifier:
             for life in self._lives[node].values():
                 self._go_on(life, ended=True)
                 self._settle(life)
+                self._leave_open(life)
             self._part.lives += len(self._lives[node])
         return self._part
 
@@ -164,10 +171,21 @@ class _Verifier:
             of = self._neighbour(message.node, data)
             answer = HistoryAnswer.from_map(data, frozenset(self._graph.neighbours(of)))
             life.told.setdefault(message.step, []).append((of, answer))
+        elif message.fields["kind"] == "revised":
+            place = message.step, _stage_in(data)
+            life.taken.setdefault(place, []).extend(_taken(data, self._graph.neighbours(message.node)))
         elif message.fields["kind"] == "gone":
             of = self._neighbour(message.node, data)
             if of in self._heard:
                 self._take_last_words(of, data.get("last"))
+
+    def _take_correction(self, message: Message) -> None:
+        life = self._life(message.node, message.born)
+        self._count(life, message)
+        made = cast(int, message.fields["at"])
+        life.corrections.setdefault((made, message.step), message)
+        if made <= life.done:
+            self._judge_corrections(life)
 
     def _neighbour(self, node: NodeId, data: Mapping[str, object]) -> NodeId:
         """The neighbour that an event is about."""
@@ -239,9 +257,11 @@ class _Verifier:
         own = self._shelves[life.id]
         for stage, following in zip(self._stages, self._published[1:], strict=True):
             told = own.said(following, step, life.born)
-            for j in () if told is None else _inputs(told):
-                if j != life.id and step not in self._shelves[j].by_stage[stage]:
-                    return j, stage, step
+            inputs = [] if told is None else [(step, _inputs(told)), *life.taken.get((step, stage), ())]
+            for of, senders in inputs:
+                for j in senders:
+                    if j != life.id and of not in self._shelves[j].by_stage[stage]:
+                        return j, stage, of
         return None
 
     def _finish_former_lives(self, life: Life) -> None:
@@ -264,7 +284,9 @@ class _Verifier:
             following = said[number + 1]
             if following is not None:
                 self._feed(life, node, stage, step, _inputs(following))
-                self._judge(life, following, node.tick(number + 1))
+                effects = [effect for effect in node.tick(number + 1) if isinstance(effect, Message)]
+                self._judge(life, following, next(again for again in effects if again.stage == following.stage))
+                life.corrected |= {(step, again.step): again for again in effects if again.stage == REVISED.name}
             elif last and not any(said[number + 1 :]):
                 return
             else:  # whose messages it used nobody knows; what is missing is counted when the next of its kind comes
@@ -272,9 +294,11 @@ class _Verifier:
                 heard = (j for j in node.neighbours if j != self._nobody and step in self._shelves[j].by_stage[stage])
                 self._feed(life, node, stage, step, heard)
                 node.tick(number + 1)
+        if self._window:
+            self._judge_corrections(life, step)
 
     def _make(self, life: Life) -> Node:
-        method = self._method(Setting(life.id, self._scenario.system(), self._graph, life.born))
+        method = self._method(Setting(life.id, self._scenario.system(), self._graph, life.born, self._window))
         return Node(
             life.id,
             (*self._graph.neighbours(life.id), self._nobody),
@@ -282,6 +306,7 @@ class _Verifier:
             Patience((1,) * len(self._stages), paced=False),  # stage n, begun at time n, ends at time n + 1
             born=life.born,
             expected=(self._nobody,),
+            window=self._window,
         )
 
     def _measured(self, life: Life, measurement: Message | None, following: Message | None) -> Array | None:
@@ -292,21 +317,27 @@ class _Verifier:
         return self._stand_in(life.id) if following is not None and life.id in _inputs(following) else None
 
     def _feed(self, life: Life, node: Node, stage: str, step: int, senders: Iterable[NodeId]) -> None:
-        """Give the node the messages of its neighbours that it used in a stage."""
+        """Give the node the messages of its neighbours that it used in a stage, and those that it took in late.
+
+        Of one sender those of a former life first: as they came.
+        """
         now = self._order[stage]
-        for j in senders:
-            if j == life.id:
-                continue
-            shelf = self._shelves[j]
-            message = shelf.by_stage[stage].get(step) or self._missed(life, j, stage, step)
-            if message is None:
-                continue
-            if (stage, step) in shelf.disputed:
-                self._miss(life, f"which {stage} of node {j}, step {step}, node {life.id} used: there are two")
+        late = [(j, of) for of, ids in life.taken.pop((step, stage), ()) for j in ids]
+        inputs = (self._input(life, j, stage, of) for j, of in (*late, *((j, step) for j in senders)) if j != life.id)
+        for message in sorted((message for message in inputs if message is not None), key=attrgetter("born")):
+            j = message.node
             if life.heard.setdefault(j, message.born) != message.born:
                 life.heard[j] = message.born
                 node.gone(j, now)
             node.receive(message, now)
+
+    def _input(self, life: Life, j: NodeId, stage: str, step: int) -> Message | None:
+        """What a neighbour said, or what stands for it if it is not there."""
+        shelf = self._shelves[j]
+        message = shelf.by_stage[stage].get(step) or self._missed(life, j, stage, step)
+        if message is not None and (stage, step) in shelf.disputed:
+            self._miss(life, f"which {stage} of node {j}, step {step}, node {life.id} used: there are two")
+        return message
 
     def _missed(self, life: Life, j: NodeId, stage: str, step: int) -> Message | None:
         """Note an input that is missing. For a measurement there is a stand-in: the covariances come out right then."""
@@ -321,11 +352,20 @@ class _Verifier:
     def _stand_in(self, node: NodeId) -> Array:
         return np.zeros(self._scenario.system().by_id[node].ny)
 
-    def _judge(self, life: Life, told: Message, effects: Sequence[Effect]) -> None:
-        """Compare what the node says with what it said."""
+    def _judge_corrections(self, life: Life, until: int | None = None) -> None:
+        """Compare the corrected estimates that are there; those of long ago that nobody told are forgotten."""
+        until = life.done if until is None else until
+        for place in sorted(place for place in life.corrections if place[0] <= until):
+            self._judge(life, life.corrections.pop(place), life.corrected.pop(place, None))
+        for place in [place for place in life.corrected if place[0] <= until - WAIT_STEPS]:
+            del life.corrected[place]
+
+    def _judge(self, life: Life, told: Message, again: Message | None) -> None:
+        """Compare what the node said with what it says; a corrected estimate may be none that comes out."""
         tally, stage = self._part.tallies[life.id], told.stage
-        again = next(effect for effect in effects if isinstance(effect, Message) and effect.stage == stage)
-        found = life.comparison.differs(stage, told.fields, again.fields)
+        nothing: Fields = {"at": None}
+        again_fields = nothing if again is None else again.fields
+        found = ("at", None) if again is None else life.comparison.differs(stage, told.fields, again_fields)
         if found is None:
             tally.identical += 1
         elif life.doubt is Doubt.CUT_OFF:
@@ -334,7 +374,7 @@ class _Verifier:
             tally.unverifiable += 1
         else:
             name, ulps = found
-            here = Difference(life.id, life.born, told.step, stage, name, told.fields[name], again.fields[name], ulps)
+            here = Difference(life.id, life.born, told.step, stage, name, told.fields[name], again_fields[name], ulps)
             life.differences += 1
             life.first = life.first or here
 
@@ -349,6 +389,14 @@ class _Verifier:
             tally.unverifiable += life.differences
         life.differences, life.first = 0, None
 
+    def _leave_open(self, life: Life) -> None:
+        """Count the corrected estimates of a step of which nothing else was told any more: it broke off in it."""
+        tally, count = self._part.tallies[life.id], len(life.corrections)
+        if self._complete:
+            tally.unverifiable += count
+        else:
+            tally.cut_off += count
+
     def _place(self, difference: Difference) -> _Order:
         return difference.step, self._order[difference.stage], self._graph.ids.index(difference.node)
 
@@ -359,7 +407,11 @@ class _Verifier:
         if lost >= 0:
             life.counters[stage] = message.seq + 1
         if lost > 0:
-            self._miss(life, f"{lost} x {stage} of node {life.id} before step {message.step}")
+            what = f"{lost} x {stage} of node {life.id} before step {message.step}"
+            if stage == REVISED.name:
+                self._name_missing(what)  # nothing depends on it
+            else:
+                self._miss(life, what)
             if self._order.get(stage, 0) > 0:
                 self._part.tallies[life.id].unverifiable += lost
         return lost > 0
@@ -370,6 +422,9 @@ class _Verifier:
             life.doubt = life.doubt or Doubt.CUT_OFF
             return
         life.doubt = Doubt.MISSING
+        self._name_missing(what)
+
+    def _name_missing(self, what: str) -> None:
         self._part.missing_count += 1
         if len(self._part.missing) < NAMED:
             self._part.missing.append(what)
@@ -378,7 +433,7 @@ class _Verifier:
         """Forget messages that all who could use them are past, or that are long over."""
         self._untidy[node] = 0
         users = [self._done[i] for i in (node, *self._graph.listeners(node)) if i in self._done]
-        self._shelves[node].forget(max(min(users), max(self._done.values()) - 2 * WAIT_STEPS))
+        self._shelves[node].forget(max(min(users), max(self._done.values()) - 2 * WAIT_STEPS) - self._window)
 
 
 def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 1) -> Verdict:
@@ -449,6 +504,25 @@ def _inputs(message: Message) -> tuple[NodeId, ...]:
     """Whose messages of the stage before went into a message, or came with them."""
     used = cast("tuple[NodeId, ...]", message.fields["used"])
     return (*used, *cast("tuple[NodeId, ...]", message.fields.get("excluded", ())))
+
+
+def _stage_in(data: Mapping[str, object]) -> str:
+    """The stage that an event "revised" is about."""
+    stage = data.get("stage")
+    if not isinstance(stage, str):
+        raise MessageError(Reason.WRONG_TYPE, f"an event about the stage {stage!r}")
+    return stage
+
+
+def _taken(data: Mapping[str, object], legal: Collection[NodeId]) -> Iterator[tuple[int, tuple[NodeId, ...]]]:
+    """Of which steps whose messages an event "revised" says were taken in."""
+    taken = data.get("taken")
+    for run in taken if isinstance(taken, list) else ():
+        match run:
+            case [int(step), list(ids)] if all(type(i) in (int, str) and i in legal for i in ids):
+                yield step, tuple(ids)
+            case _:
+                raise MessageError(Reason.WRONG_TYPE, f"taken: {run!r:.80}")
 
 
 def _another_id(ids: Sequence[NodeId]) -> NodeId:

@@ -17,18 +17,18 @@ from pathlib import Path
 from typing import Any, cast
 
 from zfusion import keys
-from zfusion.drivers.links import Link, ideal
 from zfusion.drivers.metrics import Errors, NodeReport
 from zfusion.drivers.replayed import recorded_scenario
 from zfusion.drivers.simulated import simulate
 from zfusion.drivers.sources import TableSource
 from zfusion.errors import InputError, MessageError
+from zfusion.links import Link
 from zfusion.messages import Decoder
 from zfusion.methods import METHODS
 from zfusion.model.scenario import Overrides, Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.recording.reader import Recording
-from zfusion.stages import ESTIMATE, MEASUREMENT, TRUTH, TRUTH_SENDER, Message
+from zfusion.stages import ARRIVALS, ESTIMATE, MEASUREMENT, TRUTH, TRUTH_SENDER, Message
 
 
 @dataclass(slots=True)
@@ -73,7 +73,7 @@ class Rerun:
 
 
 @dataclass(slots=True)
-class _Recorded:
+class Recorded:
     """What a recording has for the sensors and the state of a scenario."""
 
     measurements: dict[NodeId, dict[int, Array]]
@@ -89,14 +89,14 @@ def rerun(
     scenario: Scenario | Overrides,
     output: Path,
     *,
-    link: Link = ideal,
+    link: Link | None = None,
     run: str | None = None,
 ) -> Rerun:
     """Run another scenario, or the recorded one with overrides, on the recorded measurements; write `output`.
 
     The sensors of the scenario must be on the recording; it may leave some out. Nodes that had no reading then have
-    none now. As many steps as are recorded, at most as many as the scenario has; `link` decides which messages
-    arrive. `run` names the new run, by default the old one's name with "-rerun".
+    none now. As many steps as are recorded, at most as many as the scenario has; `link` in the place of the scenario's
+    links decides which messages arrive, and when. `run` names the new run, by default the old one's name with "-rerun".
 
     InputError for a sensor that is not on the recording, or not of the size that the scenario says, or if `output`
     is the recording itself; otherwise as `simulate`.
@@ -105,7 +105,7 @@ def rerun(
         raise InputError(f"{output}: is the recording that is to be run again")
     old = recorded_scenario(recording)
     wanted = scenario if isinstance(scenario, Scenario) else old.with_overrides(**scenario)
-    recorded = _read(recording, wanted)
+    recorded = read_recorded(recording, wanted)
     new = _on_recording(wanted, recording.path, min(wanted.steps, recorded.steps))
     sources = {i: TableSource(recorded.measurements[i], recorded.truths, recorded.refused[i]) for i in new.ids}
     name = keys.check_run(run or f"{recording.metadata['run']}-rerun")
@@ -113,6 +113,27 @@ def rerun(
     with Recording.open(output) as again:
         changes = _compare(recording, old, again, new, recorded.truths)
     return Rerun(new, reports, changes)
+
+
+def with_recorded_links(scenario: Scenario, recording: Recording) -> Scenario:
+    """The scenario with the latencies and losses that the recording measured in the place of its links.
+
+    InputError where it has measured none.
+    """
+    if not any(topic.endswith(f"/{ARRIVALS.name}") for topic in recording.topics):
+        raise InputError(f"{recording.path}: no latencies were measured in it: it has no messages {ARRIVALS.name!r}")
+    document = tomllib.loads(scenario.anchored().to_toml())
+    document["links"] = {"recorded": {"recording": str(recording.path.absolute())}}
+    return Scenario.model_validate(document)
+
+
+def on_recording(recording: Recording, scenario: Scenario | None = None) -> Scenario:
+    """The recorded scenario, or another one, with the recording as the source of all measurements and of the truth.
+
+    Of as many steps as are recorded, at most as many as it has. InputError as `rerun`.
+    """
+    wanted = recorded_scenario(recording) if scenario is None else scenario
+    return _on_recording(wanted, recording.path, min(wanted.steps, read_recorded(recording, wanted).steps))
 
 
 def _on_recording(scenario: Scenario, path: Path, steps: int) -> Scenario:
@@ -124,7 +145,7 @@ def _on_recording(scenario: Scenario, path: Path, steps: int) -> Scenario:
     return Scenario.model_validate(document)
 
 
-def _read(recording: Recording, scenario: Scenario) -> _Recorded:
+def read_recorded(recording: Recording, scenario: Scenario) -> Recorded:
     """All measurements and truths, of two of one step the first; InputError for a sensor of which there is nothing."""
     system, run = scenario.system(), recording.metadata["run"]
     readers: dict[str, tuple[NodeId, Decoder]] = {
@@ -132,7 +153,7 @@ def _read(recording: Recording, scenario: Scenario) -> _Recorded:
         for i in scenario.ids
     }
     readers[keys.truth_key(run)] = (TRUTH_SENDER, Decoder(TRUTH, TRUTH_SENDER, sizes={"nx": system.nx}))
-    recorded = _Recorded({i: {} for i in scenario.ids})
+    recorded = Recorded({i: {} for i in scenario.ids})
     found: set[NodeId] = set()
     refusals: dict[NodeId, str] = {}
     for topic, data, *_ in recording.records(readers):
@@ -152,7 +173,7 @@ def _read(recording: Recording, scenario: Scenario) -> _Recorded:
     return recorded
 
 
-def _keep(recorded: _Recorded, message: Message) -> None:
+def _keep(recorded: Recorded, message: Message) -> None:
     if message.stage == TRUTH.name:
         recorded.truths.setdefault(message.step, cast(Array, message.fields["x"]))
         return

@@ -12,13 +12,36 @@ With its own measurement only it is the *local* filter, with everybody's the *ce
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from zfusion.methods.covariances import Gains, advance, prior
+from zfusion.methods.covariances import Gains, State, advance, prior
 from zfusion.methods.layout import Layout
 from zfusion.model.statistics import StepModel
 from zfusion.model.types import Array, NodeId
+
+
+class Standing(NamedTuple):
+    """Where a filter stands after a step; frozen, so that it can be gone back to."""
+
+    state: State
+    step: Array | None
+    """(x̂, μ)_k = step (x̂_{k-1}, μ_{k-1}, Z_k); None before the first."""
+    known: Array
+    """(x̂, μ), (nx + size,)."""
+    nx: int
+
+    @property
+    def x(self) -> Array:
+        """x̂_{k/k}, (nx,)."""
+        return self.known[: self.nx]
+
+    @property
+    def P(self) -> Array:
+        """Covariance of its error, (nx, nx)."""
+        covariance: Array = self.state.P.arrays[0][0, :, 0]
+        return covariance
 
 
 class LeastSquaresFilter:
@@ -48,6 +71,15 @@ class LeastSquaresFilter:
         """Covariance of its error, (nx, nx)."""
         covariance: Array = self._state.P.arrays[0][0, :, 0]
         return covariance
+
+    @property
+    def standing(self) -> Standing:
+        """Where it stands: to go back to, with `return_to`."""
+        return Standing(self._state, self._step, self._known, self._nx)
+
+    def return_to(self, standing: Standing) -> None:
+        """Go on from there: the next step is the one after it, and comes out as if nothing had been between."""
+        self._state, self._step, self._known = standing.state, standing.step, standing.known
 
     @property
     def settled(self) -> bool:

@@ -70,6 +70,17 @@ class Tracked(NamedTuple):
     exact: tuple[bool, ...]
 
 
+class Past(NamedTuple):
+    """The state of a step, for what is known now, and for whom it is right."""
+
+    state: State
+    exact: Mapping[NodeId, bool]
+
+    def knows(self, node: NodeId) -> bool:
+        """Whether the node's covariances are right."""
+        return self.exact[node]
+
+
 class Neighbourhood:
     """Tracks P^(lj) for l, j in N_i with the help of the ledger."""
 
@@ -80,8 +91,13 @@ class Neighbourhood:
         sizes: Mapping[NodeId, int],
         statistics: Statistics,
         initial: PriorMoments,
+        *,
+        revisable: int = 0,
     ) -> None:
-        """`neighbourhoods` are those of all l in N_i, `sizes` those of all sensors in them."""
+        """`neighbourhoods` are those of all l in N_i, `sizes` those of all sensors in them.
+
+        `revisable`: how many steps before its last message a node may have changed what it used without our knowing.
+        """
         self._layout = Layout.build(neighbourhoods, sizes)
         self._nodes = self._layout.nodes
         self._row = {node: row for row, node in enumerate(self._nodes)}
@@ -93,8 +109,9 @@ class Neighbourhood:
         self._recent: dict[int, Tracked] = {0: start}
         """The last states up to the head, in ascending order of their steps."""
         self._aside: dict[int, Tracked] = {}
-        """For each row that is not exact at the head: the last state at which it was, if there is one."""
-        self._window = max(2, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
+        """For each row that is not exact at the head: the last state at which it was for good, if there is one."""
+        self._revisable = revisable
+        self._window = max(2 + revisable, min(WINDOW, WINDOW_BYTES // (3 * start.state.Pi.nbytes + 1)))
         self._named: tuple[tuple[bool, ...], frozenset[NodeId]] = (start.exact, frozenset(self._nodes))
         self._masks: dict[tuple[UsedSet | None, ...], Used] = {}
         self._joints: dict[tuple[NodeId, ...], Ints] = {}
@@ -129,14 +146,19 @@ class Neighbourhood:
             return None
         return history.first_unknown(base.step + 1, step)
 
-    def joint(self, others: tuple[NodeId, ...]) -> Array:
-        """The covariances at the newest step that `fusion_weights` needs to fuse the sorted `others`."""
+    def at(self, step: int) -> Past | None:
+        """The state of a past step, from all that is known now; None if it is not kept, or not reached yet."""
+        kept = self._recent.get(step)
+        return None if kept is None else Past(kept.state, dict(zip(self._nodes, kept.exact, strict=True)))
+
+    def joint(self, others: tuple[NodeId, ...], state: State | None = None) -> Array:
+        """The covariances that `fusion_weights` needs to fuse the sorted `others`: of `state`, or the newest."""
         index = self._joints.get(others)
         if index is None:
             if len(self._joints) == COMBINATIONS:
                 self._joints.clear()
             index = self._joints[others] = joint_index(self._layout, (self._node, *others), len(self._initial.mean))
-        return self._head.state.P.flat.take(index)
+        return (state or self._head.state).P.flat.take(index)
 
     def moments(self, step: int) -> PriorMoments:
         """Mean and covariance of the state at `step`, before any measurement."""
@@ -186,11 +208,19 @@ class Neighbourhood:
         if following.exact != self._head.exact:
             for row, (before, after) in enumerate(zip(self._head.exact, following.exact, strict=True)):
                 if before and not after:
-                    self._aside[row] = self._head
+                    self._aside[row] = self._newest_for_good()
                 elif after:
                     self._aside.pop(row, None)
         self._head = self._recent[following.step] = following
         self._recent.pop(following.step - self._window, None)
+
+    def _newest_for_good(self) -> Tracked:
+        """The newest state that nothing which the nodes used up to the head, and may still revise, has a part in."""
+        if not self._revisable:
+            return self._head
+        floor = self._head.step - self._revisable
+        states = list(self._recent.values())
+        return next((kept for kept in reversed(states) if kept.step <= floor), states[0])
 
     def _go_back(self, row: int, changed: int, ledger: Ledger) -> None:
         """Go back before `changed`, to the newest state from which this row can be followed up to the head."""
@@ -205,6 +235,8 @@ class Neighbourhood:
             return
         self._recent = {step: kept for step, kept in self._recent.items() if step < base.step}
         self._recent[base.step] = self._head = base
+        # What was put aside after that step has this row's old used sets in it; it is put aside anew on the way.
+        self._aside = {r: kept for r, kept in self._aside.items() if kept.step <= base.step}
 
     def _distrust(self, row: int, changed: int, base: Tracked | None) -> None:
         """The states from `changed` on are not right for this row, whatever they seemed; that of `base` still is."""

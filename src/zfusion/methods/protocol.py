@@ -32,6 +32,8 @@ class Setting:
     """Whose neighbourhoods the method uses: the scenario's, after `Method.network`."""
     born: int = 1
     """First step of this life; a node that was restarted begins later, from the prior, having used nothing before."""
+    window: int = 0
+    """Steps that `Revising.revise` and `Revising.correct` may go back."""
 
 
 class Outcome(NamedTuple):
@@ -54,6 +56,8 @@ class Method(Protocol):
 
     name: ClassVar[str]
     stages: ClassVar[tuple[Stage, ...]]
+    revises: ClassVar[bool]
+    """Whether it is `Revising`: it can take in what comes late."""
 
     def __init__(self, setting: Setting) -> None: ...
 
@@ -69,3 +73,21 @@ class Method(Protocol):
 
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
         """Take in what arrived of a stage, the own message included; the next stage's fields, or the outcome."""
+
+
+class Revising(Method, Protocol):
+    """A method that can go back: afterwards all is as if what was late had been in time."""
+
+    def revise(self, late: Mapping[int, Mapping[NodeId, Fields]]) -> dict[int, UsedSet]:
+        """Take in messages of the first stage of past steps, up to `Setting.window` before the one that is going on.
+
+        Called before `advance` of the first stage. Returns by step, ascending, whose were taken in: not those whose
+        had been used before, and not those that hold nothing.
+        """
+
+    def correct(self, step: int, heard: Mapping[NodeId, Fields]) -> Outcome:
+        """The estimate of a past step with all that is known now; called after `advance` of the last stage.
+
+        `heard` are the neighbours' messages of the last stage, of that step, where that is not the first: those that
+        were computed with just the used sets that the ledger has now.
+        """

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import ClassVar, NamedTuple, cast
 
 import numpy as np
 
 from zfusion.methods.covariances import State
 from zfusion.methods.fusion import fuse, fusion_weights
-from zfusion.methods.least_squares import LeastSquaresFilter
+from zfusion.methods.least_squares import LeastSquaresFilter, Standing
 from zfusion.methods.neighbourhood import Neighbourhood, StepModels
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.model.network import Network
@@ -32,6 +32,7 @@ class Centralized:
 
     name: ClassVar[str] = "centralized"
     stages: ClassVar[tuple[Stage, ...]] = (MEASUREMENT,)
+    revises: ClassVar[bool] = True
 
     @staticmethod
     def network(graph: Network) -> Network:
@@ -47,6 +48,9 @@ class Centralized:
         self._models = StepModels(lambda: step_models(system, neighbourhood))
         start = prior_moments(system) if setting.born == 1 else self._models.at(setting.born - 1)[1]
         self._filter = LeastSquaresFilter(neighbourhood, sizes, start.mean, start.covariance)
+        self._window = setting.window
+        self._past = {setting.born - 1: _Past({}, self._filter.standing)}
+        """The last steps, as far as they may be gone back to, and the one before them."""
 
     def begin(self, step: int, y: Array | None) -> Fields:  # noqa: ARG002
         """The measurement, as it is."""
@@ -54,7 +58,28 @@ class Centralized:
 
     def skip(self, step: int) -> None:
         """Go through a step without measurements."""
-        self._filter.step(self._models.at(step)[0], {})
+        self._take_step(step, {})
+
+    def revise(self, late: Mapping[int, Mapping[NodeId, Fields]]) -> dict[int, UsedSet]:
+        """Go back to before the first step of which something is new, and forward again with it."""
+        past, new = self._past, dict[int, dict[NodeId, Array]]()
+        for step in sorted(late):
+            found = self._measurements(late[step])
+            found = {j: y for j, y in found.items() if j not in past[step].measurements}
+            if found:
+                new[step] = found
+        if new:
+            first, end = min(new), max(past) + 1
+            self._filter.return_to(past[first - 1].standing)
+            for step in range(first, end):
+                both = {**past[step].measurements, **new.get(step, {})}
+                self._take_step(step, {j: both[j] for j in self._neighbourhood if j in both})
+        return {step: tuple(found) for step, found in new.items()}
+
+    def correct(self, step: int, heard: Mapping[NodeId, Fields]) -> Outcome:  # noqa: ARG002
+        """What the filter has for that step by now."""
+        past = self._past[step]
+        return Outcome(past.standing.x, past.standing.P, tuple(past.measurements))
 
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
         """Filter with what arrived."""
@@ -62,13 +87,30 @@ class Centralized:
         return Outcome(self._filter.x, self._filter.P, used)
 
     def _filter_step(self, step: int, arrived: Mapping[NodeId, Fields]) -> UsedSet:
+        measurements = self._measurements(arrived)
+        self._take_step(step, measurements)
+        return tuple(measurements)
+
+    def _measurements(self, arrived: Mapping[NodeId, Fields]) -> dict[NodeId, Array]:
         measurements: dict[NodeId, Array] = {}
         for j in self._neighbourhood:  # in sorted order, whatever the order of arrival
             y = arrived[j]["y"] if j in arrived else None
             if y is not None:
                 measurements[j] = cast(Array, y)
+        return measurements
+
+    def _take_step(self, step: int, measurements: Mapping[NodeId, Array]) -> None:
         self._filter.step(self._models.at(step)[0], measurements)
-        return tuple(measurements)
+        if self._window:
+            self._past[step] = _Past(measurements, self._filter.standing)
+            self._past.pop(step - self._window - 1, None)
+
+
+class _Past(NamedTuple):
+    """What a step was made of, and where the filter stood after it."""
+
+    measurements: Mapping[NodeId, Array]
+    standing: Standing
 
 
 class Local(Centralized):
@@ -103,6 +145,7 @@ class TwoStage(Centralized):
             {j: system.by_id[j].ny for j in sensors},
             lambda: step_models(system, sensors),
             prior_moments(system),
+            revisable=setting.window,
         )
         self._others = tuple(j for j in self._neighbourhood if j != self._node)
         self._weights: _Weights | None = None
@@ -125,6 +168,17 @@ class TwoStage(Centralized):
         used = tuple(j for j in self._neighbourhood if j == self._node or j in fused)
         ask = {j: first for j in excluded if (first := self._neighbours.missing(j, step, ledger)) is not None}
         return Outcome(x, P, used, excluded, ask)
+
+    def correct(self, step: int, heard: Mapping[NodeId, Fields]) -> Outcome:
+        """Fuse the own estimate, as it would be now, with the others of that step whose covariances are known."""
+        own, at = self._past[step].standing, self._neighbours.at(step)
+        fused = () if at is None else tuple(j for j in self._others if j in heard and at.knows(j))
+        x, P = own.x, own.P
+        if at is not None and fused:
+            prior = self._neighbours.moments(step)
+            weights, P = fusion_weights(self._neighbours.joint(fused, at.state), prior.covariance)
+            x = fuse(x, [cast(Array, heard[j]["x"]) for j in fused], prior.mean, weights)
+        return Outcome(x, P, tuple(j for j in self._neighbourhood if j == self._node or j in fused))
 
     def _fuse(self, step: int, fused: UsedSet, arrived: Mapping[NodeId, Fields]) -> tuple[Array, Array]:
         if not fused:
