@@ -1,7 +1,7 @@
 """The line between a launcher and the processes that it started: JSON, a line a message, over a socket pair.
 
     child -> launcher    {"status": {...}}  {"report": {...}}  {"error": "...", "exit_code": 2}
-    launcher -> child    stop
+    launcher -> child    {"epoch_ns": ...} (to the network alone)  stop
 
 When the launcher is gone, however it went, the child reads the end of the line and stops.
 """
@@ -41,13 +41,19 @@ class ChildEnd:
             except OSError:
                 return
 
-    def on_stop(self, stop: Callable[[], None]) -> None:
-        """Have `stop` called, from another thread, when the launcher says so or is gone."""
-        threading.Thread(target=self._listen, args=(stop,), name="control", daemon=True).start()
+    def on_stop(self, stop: Callable[[], None], hear: Callable[[Mapping[str, Any]], None] = lambda _: None) -> None:
+        """Have `stop` called, from another thread, when the launcher says so or is gone; `hear`, what else it says."""
+        threading.Thread(target=self._listen, args=(stop, hear), name="control", daemon=True).start()
 
-    def _listen(self, stop: Callable[[], None]) -> None:
-        with suppress(OSError):  # gone: the same as the end of the line
-            self._socket.recv(len(STOP))
+    def _listen(self, stop: Callable[[], None], hear: Callable[[Mapping[str, Any]], None]) -> None:
+        with (
+            suppress(OSError),
+            self._socket.makefile("rb", buffering=0) as lines,
+        ):  # gone: the same as the end of the line
+            for line in lines:
+                if line == STOP:
+                    break
+                hear(json.loads(line))
         stop()
 
 
@@ -61,10 +67,15 @@ class LauncherEnd:
 
     def stop(self) -> None:
         """Ask the child to stop."""
-        try:
-            self.socket.sendall(STOP)
-        except OSError:
-            return  # it is gone already
+        self._send(STOP)
+
+    def tell(self, **message: object) -> None:
+        """Send a message; nothing happens where the child is gone."""
+        self._send(json.dumps(message).encode() + b"\n")
+
+    def _send(self, line: bytes) -> None:
+        with suppress(OSError):  # it is gone already
+            self.socket.sendall(line)
 
     def messages(self) -> Iterator[Mapping[str, Any]]:
         """What the child has said since the last call, without waiting."""

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
@@ -25,12 +25,16 @@ from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.swarm.control import LauncherEnd
+from zfusion.swarm.netns.addresses import places
 
 STOP_S = 15.0
 """How long a process that was told to stop may take: a node waits some seconds for its neighbours to hear it out."""
 
 TICK_S = 0.1
 """How often processes are looked after when nothing is heard of them."""
+
+BLINK_S = 0.002
+"""How soon it is looked again whether a process that has said that it stops, or dies, has done so."""
 
 MAX_RESTARTS = 10
 """Lives that `restart` gives a node beyond the first; one that keeps dying has a cause that more lives do not mend."""
@@ -45,6 +49,8 @@ between our finding it free and the node's listening on it."""
 _tried = count(os.getpid() * 61)
 """Two launchers begin at different places."""
 
+ZFUSION = (sys.executable, "-m", "zfusion")
+
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """A node's matrices are small: threads of a BLAS only get into each other's way, and the other nodes'."""
 
@@ -55,16 +61,22 @@ class Child:
 
     name: str
     node: NodeId | None
-    """None for the recorder."""
+    """None for the recorder and the network."""
     command: list[str]
     log: Path
+    place: int = 0
+    """Its number among the namespaces, where there are any."""
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
     reports: list[Mapping[str, Any]] = field(default_factory=list)
+    told: bool = False
+    """Whether it has reported on its present life."""
     error: str | None = None
     exit_code: int | None = None
     restarts: int = 0
+    blow: Mapping[str, Any] | None = None
+    """What has felled it by plan, as `misfortune.Blow`, until it is raised again."""
 
     @property
     def running(self) -> bool:
@@ -87,6 +99,8 @@ class RunResult:
     """Stopped before its end."""
     elapsed_s: float
     logs: Path
+    network: Mapping[str, Any] | None = None
+    """What the network between the namespaces was, and what it counted; None where there was none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +111,8 @@ class LaunchOptions:
     logs: Path
     recording: Path | None
     restart: bool = False
+    netns: str | None = None
+    """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -121,6 +137,7 @@ class Launcher:
             self._file.write_text(scenario.anchored().to_toml())
         except OSError as error:
             raise InputError(f"{options.logs}: cannot be written: {error.strerror}") from None
+        self._network = self._plan_network()
         self._recorder, self._nodes = self._plan()
 
     def run(self) -> RunResult:
@@ -130,11 +147,14 @@ class Launcher:
         """
         began = time.monotonic()
         try:
-            for child in self._everybody():
-                self._start(child)
+            if self._network is None or self._has_come_up(self._network):
+                for child in self._everybody():
+                    if child is not self._network:
+                        self._start(child)
             self._watch_nodes()
             self._kill(self._nodes.values())
-            self._finish_recording()
+            self._finish(self._recorder)
+            self._finish(self._network)
         finally:
             self._kill(self._everybody())
             self._selector.close()
@@ -147,6 +167,7 @@ class Launcher:
             interrupted=self._stop_by is not None,
             elapsed_s=time.monotonic() - began,
             logs=self._options.logs,
+            network=self._network_report(),
         )
 
     def interrupt(self) -> None:
@@ -156,33 +177,67 @@ class Launcher:
     def _plan(self) -> tuple[Child | None, dict[NodeId, Child]]:
         scenario, options = self._scenario, self._options
         transport, common = scenario.transport, ["--run", options.run]
-        listens = dict(zip(scenario.ids, free_endpoints(len(scenario.ids)), strict=True)) | transport.endpoints
-        base = [sys.executable, "-m", "zfusion"]
+        listens, recorder_dials = self._endpoints()
         nodes: dict[NodeId, Child] = {}
-        for i in scenario.ids:
-            command = [*base, "node", str(self._file), "--id", str(i), *common]
-            if not transport.zenoh_config:
-                command += ["--listen", listens[i], *_each("--connect", dialled(scenario, i, listens))]
+        for place, i in enumerate(scenario.ids):
+            command = [*ZFUSION, "node", str(self._file), "--id", str(i), *common]
+            if self._network is not None or not transport.zenoh_config:
+                command += _each("--listen", dict.fromkeys((listens[i], recorder_dials[i])))
+                command += _each("--connect", dialled(scenario, i, listens))
             if options.recording is not None:
                 command.append("--await-recorder")
-            nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log")
+            if self._network is not None:
+                command.append("--no-emulation")
+            nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
-            command = [*base, "record", str(self._file), *common, "-o", str(options.recording)]
-            if not transport.zenoh_config:
-                command += _each("--connect", [listens[i] for i in scenario.ids])
-            recorder = Child("the recorder", None, command, options.logs / "recorder.log")
+            command = [*ZFUSION, "record", str(self._file), *common, "-o", str(options.recording)]
+            if self._network is not None or not transport.zenoh_config:
+                command += _each("--connect", [recorder_dials[i] for i in scenario.ids])
+            recorder = Child("the recorder", None, command, options.logs / "recorder.log", len(scenario.ids))
         return recorder, nodes
 
+    def _endpoints(self) -> tuple[Mapping[NodeId, str], Mapping[NodeId, str]]:
+        """Where every node is dialled by the others, and where by the recorder."""
+        ids = self._scenario.ids
+        if self._network is not None:
+            where = places(ids)
+            return {p.node: p.endpoint for p in where}, {p.node: p.recorder_dials for p in where}
+        listens = dict(zip(ids, free_endpoints(len(ids)), strict=True)) | self._scenario.transport.endpoints
+        return listens, listens
+
+    def _plan_network(self) -> Child | None:
+        options = self._options
+        if options.netns is None:
+            return None
+        command = [*ZFUSION, "network", str(self._file), "--run", options.run]
+        if options.netns != "auto":
+            command += ["--kind", options.netns]
+        return Child("the network", None, command, options.logs / "network.log")
+
     def _everybody(self) -> list[Child]:
-        return [child for child in (self._recorder, *self._nodes.values()) if child is not None]
+        return [child for child in (self._network, self._recorder, *self._nodes.values()) if child is not None]
+
+    def _has_come_up(self, network: Child) -> bool:
+        """Start the network and wait until the namespaces are there; False where it ends, or is to end, before."""
+        self._start(network)
+        while network.running and not network.status and not self._interrupts:
+            self._look_after_all()
+        if self._interrupts:
+            self._stop_nodes()
+        elif network.status:
+            kind = network.status["kind"]
+            self._options.on_message(f"network namespaces: {kind} ({network.status['why']})")
+            if self._recorder is not None:
+                self._recorder.command += ["--network", kind]
+        return network.running and not self._interrupts
 
     def _start(self, child: Child) -> None:
         line = child.line = LauncherEnd()
         number = line.child.fileno()
         with child.log.open("ab") as log:
             child.process = subprocess.Popen(
-                [*child.command, "--control-fd", str(number)],
+                [*self._entrance(child), *child.command, "--control-fd", str(number)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -193,13 +248,21 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status = None, None, {}
+        child.exit_code, child.error, child.status, child.told = None, None, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
+
+    def _entrance(self, child: Child) -> Sequence[str]:
+        """The words before its command that have it run in its namespace."""
+        if self._network is None or child is self._network:
+            return ()
+        words: Sequence[str] = self._network.status["enter"][child.place]
+        return words
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
         while any(child.running for child in self._nodes.values()):
             self._look_after_all()
+            self._dismiss_latecomers()
             if self._interrupts and self._stop_by is None:
                 self._options.on_message("stopping (once more kills)")
                 self._stop_nodes()
@@ -211,8 +274,16 @@ class Launcher:
                 self._failures.append(f"{', '.join(stuck)}: did not stop within {STOP_S:g} s and had to be killed")
                 return
 
+    def _dismiss_latecomers(self) -> None:
+        """Stop nodes that were started again and find nobody to join any more: all others have ended."""
+        running = [child for child in self._nodes.values() if child.running]
+        if all(child.restarts and child.status.get("phase") != "running" for child in running):
+            for child in running:
+                if child.line is not None:
+                    child.line.stop()
+
     def _look_after_all(self) -> None:
-        for key, _ in self._selector.select(TICK_S):
+        for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
         for child in self._everybody():
             if child.running and child.process is not None and child.process.poll() is not None:
@@ -225,11 +296,21 @@ class Launcher:
         for message in child.line.messages():
             if "status" in message:
                 child.status = message["status"]
-                self._begun |= child.status.get("phase") in {"running", "done"}
+                self._note_beginning(child.status)
+            elif "blow" in message:
+                self._note_blow(child, message["blow"])
+                child.reports += [message["report"]] if message["report"] else []
             elif "report" in message:
                 child.reports.append(message["report"])
+                child.told = True
             elif "error" in message:
                 child.error = message["error"]
+
+    def _note_beginning(self, status: Mapping[str, Any]) -> None:
+        if not self._begun and status.get("phase") in {"running", "done"}:
+            self._begun = True
+            if self._network is not None and self._network.line is not None:
+                self._network.line.tell(epoch_ns=status["epoch_ns"])
 
     def _on_end(self, child: Child, code: int) -> None:
         self._listen(child)
@@ -237,10 +318,13 @@ class Launcher:
         self._selector.unregister(child.line.socket)
         child.line.close()
         child.exit_code = code
-        if code == 0:
+        if code == 0 or (child.blow is not None and code == -signal.SIGKILL):
             return
-        if child.node is not None and child.status:
-            child.reports.append(asdict(NodeReport.cut_short(child.node, child.status)))
+        # Without its recorder a swarm is not recorded; without its network, or a node at the start, there is none.
+        essential = child.node is None or not self._begun
+        if essential and code == InputError.exit_code and child.error is not None:
+            raise InputError(f"{child.name}: {child.error}")
+        self._note_cut_short(child)
         message = f"{child.name} died{_step(child)}: {_cause(child, code)}"
         restarting = self._may_restart(child)
         self._options.on_message(
@@ -251,10 +335,53 @@ class Launcher:
             self._start(child)
             return
         self._failures.append(message)
-        if child.node is None or not self._begun:
-            self._stop_nodes()  # a swarm without its recorder is not recorded; one without this node never begins
-            if code == InputError.exit_code and child.error is not None:
-                raise InputError(f"{child.name}: {child.error}")
+        if child is self._network:
+            self._kill(self._nodes.values())  # they could only wait for each other
+        if essential:
+            self._stop_nodes()
+
+    def _note_blow(self, child: Child, blow: Mapping[str, Any]) -> None:
+        child.blow = blow
+        until = f" until step {blow['until_step']}" if blow["until_step"] else ""
+        done = {"kill": "killed", "stop": "stopped"}[blow["kind"]]
+        self._options.on_message(f"{child.name} {done} at step {blow['step']}{until}, as planned")
+
+    def _raise_fallen(self) -> float:
+        """Start again, or set going, the nodes that were felled by plan and whose time has come.
+
+        Seconds until the next one's may come.
+        """
+        wait = TICK_S
+        for child in self._nodes.values():
+            if child.blow is None or child.blow["until_step"] is None or self._stop_by is not None:
+                continue
+            left = self._left(child, child.blow)
+            if left > 0:
+                wait = min(wait, left)
+            elif child.blow["kind"] == "kill" and not child.running:
+                child.blow = None
+                child.restarts += 1
+                self._start(child)
+            elif child.process is not None and is_stopped(child.process.pid):
+                child.blow = None
+                child.process.send_signal(signal.SIGCONT)
+            else:
+                wait = min(wait, BLINK_S)
+        return wait
+
+    def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
+        """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
+        if blow["until_ns"] is not None:
+            left: float = (blow["until_ns"] - time.time_ns()) / 1e9
+            return left
+        others = [other for other in self._nodes.values() if other is not child and other.running]
+        reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
+        return 0 if reached or (not others and blow["kind"] == "stop") else TICK_S
+
+    def _note_cut_short(self, child: Child) -> None:
+        """What is known of a node's life that did not end by itself."""
+        if child.node is not None and child.status and not child.told:
+            child.reports.append(asdict(NodeReport.cut_short(child.node, child.status)))
 
     def _may_restart(self, child: Child) -> bool:
         return (
@@ -271,24 +398,36 @@ class Launcher:
 
     def _stop_nodes(self) -> None:
         self._stop_by = self._stop_by or time.monotonic() + STOP_S
+        if self._network is not None and self._network.line is not None:
+            self._network.line.tell(epoch_ns=None)  # nothing is cut any more: they are to hear each other out
         for child in self._nodes.values():
             if child.running and child.line is not None:
                 child.line.stop()
+                if child.blow is not None and child.process is not None:
+                    child.process.send_signal(signal.SIGCONT)
 
-    def _finish_recording(self) -> None:
-        child, end = self._recorder, time.monotonic() + STOP_S
+    def _finish(self, child: Child | None) -> None:
+        """Have the recorder, or the network, end."""
+        end = time.monotonic() + STOP_S
         if child is None or not child.running or child.line is None:
             return
         child.line.stop()
         while child.running and time.monotonic() < end:
             self._look_after_all()
         if child.running:
-            self._failures.append(f"the recorder: did not finish within {STOP_S:g} s and had to be killed")
+            self._failures.append(f"{child.name}: did not finish within {STOP_S:g} s and had to be killed")
 
     def _recorder_report(self) -> RecorderReport | None:
         if self._recorder is None or not self._recorder.reports:
             return None
         return RecorderReport(**self._recorder.reports[-1])
+
+    def _network_report(self) -> Mapping[str, Any] | None:
+        """What it told at its end; of one that died before, what it was."""
+        network = self._network
+        if network is None or not network.status:
+            return None
+        return network.reports[-1] if network.reports else {name: network.status[name] for name in ("kind", "why")}
 
     def _kill(self, children: Collection[Child]) -> None:
         """End what has not ended yet."""
@@ -296,6 +435,8 @@ class Launcher:
             if child.running and child.process is not None and child.line is not None:
                 child.process.kill()
                 child.exit_code = child.process.wait()
+                self._listen(child)
+                self._note_cut_short(child)
                 self._selector.unregister(child.line.socket)
                 child.line.close()
 
@@ -318,6 +459,14 @@ def free_endpoints(number: int) -> list[str]:
     finally:
         for s in sockets:
             s.close()
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process stands still, by a signal."""
+    state = Path(f"/proc/{pid}/stat")
+    if not state.exists():
+        return sys.platform != "linux"  # where that cannot be seen, it is taken at its word
+    return state.read_text().rpartition(")")[2].split()[0] == "T"
 
 
 def _let_finish(pid: int) -> None:
