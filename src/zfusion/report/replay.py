@@ -40,14 +40,21 @@ def show_verdict(console: Console, verdict: Verdict) -> None:
 def show_rerun(console: Console, done: Rerun, output: Path) -> None:
     """Print how the estimates of a rerun differ from the recorded ones."""
     table = Table()
-    for name in ("node", "steps compared", "rms difference", "rmse recorded", "rmse now"):
+    for name in ("node", "steps compared", "rms difference", "rmse recorded", "rmse now", "change"):
         table.add_column(name, justify="left" if name == "node" else "right")
     for node, change in done.changes.items():
         rms = "-" if change.rms is None else f"{change.rms:.5g}"
-        table.add_row(str(node), str(change.compared), rms, _rmse(change.before), _rmse(change.after))
+        before, after = change.before, change.after
+        table.add_row(str(node), str(change.compared), rms, _rmse(before), _rmse(after), _change(before, after))
     console.print(table)
     console.print(f"recording: {output}", soft_wrap=True)
 
 
 def _rmse(errors: Mapping[str, float]) -> str:
     return f"{errors['rmse']:.5g}" if "rmse" in errors else "-"
+
+
+def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    if not before.get("rmse") or "rmse" not in after:
+        return "-"
+    return f"{after['rmse'] / before['rmse'] - 1:+.1%}"

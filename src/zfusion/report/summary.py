@@ -13,10 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from zfusion.drivers.meters import add_up
 from zfusion.drivers.metrics import Latencies, NodeReport, RecorderReport
+from zfusion.links import Timeline
 from zfusion.methods.prediction import predict
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
+from zfusion.report.latency import emulated, of_edge, of_node, show_latencies
 from zfusion.report.table import shown_estimate
 from zfusion.stages import ESTIMATE
 
@@ -28,6 +31,10 @@ DESIGNED = {"intermediate": "intermediate", ESTIMATE.name: "distributed"}
 
 HEADINGS = {"intermediate": "intermed."}
 """Stages by shorter names, so that the table fits into 80 columns."""
+
+
+LATE_FATES = {"revised": "taken in", "too_late": "beyond the window", "stale": "of no use any more"}
+"""What becomes of late messages where nodes revise, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +51,11 @@ class Edge:
     missed: int
     """Not there at the deadline, whatever the reason."""
     recorded: int | None
+    used_fraction: float | None
+    latency_us: dict[str, Any]
+    budget_us: dict[str, float]
+    clock: dict[str, float]
+    """These as `latency.of_edge`."""
 
 
 def summarize(
@@ -56,13 +68,16 @@ def summarize(
     interrupted: bool = False,
     simulated: bool = False,
     logs: str | None = None,
+    network: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
+    revised, too_late, stale (`EdgeCounters`),
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
-    recording; and the verdict on each edge.
+    recording; the verdict on each edge, with its latencies and budget; rounds {node} (`latency.of_node`); what link
+    emulation did (emulated), what was planned to go wrong (faults), and what a network of namespaces did (network).
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
@@ -79,6 +94,7 @@ def summarize(
         "messages": {"sent": dict(sent), "recorded": dict(recorder.recorded) if recorder else {}},
         "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
         "late": sum(edge.late for edge in edges),
+        **{kind: _of_all_edges(lives, kind) for kind in LATE_FATES},
         "missed": sum(edge.missed for edge in edges),
         "refused": _refused(lives),
         "fallbacks": sum(report.fallbacks for report in lives),
@@ -99,10 +115,14 @@ def summarize(
         "recording": recorder.path if recorder else None,
         "lost_on_recording": dict(recorder.lost) if recorder else {},
         "edges": [asdict(edge) for edge in edges],
+        "rounds": {str(i): of_node(lives) for i, lives in reports.items()},
+        "emulated": emulated(reports),
+        "faults": [dict(planned.told) for planned in Timeline(scenario).planned],
         "interrupted": interrupted,
         "simulated": simulated,
         "failures": list(failures),
         "logs": logs,
+        "network": network,
     }
 
 
@@ -115,11 +135,12 @@ def _edges(
     """
     by_text = {str(i): lives for i, lives in reports.items()}
     for receiver, lives in by_text.items():
+        total = add_up(report.measured for report in lives)
         for sender in dict.fromkeys(j for report in lives for j in report.edges):
             told = [report.edges[sender] for report in lives if sender in report.edges]
             senders_lives = by_text.get(sender, ())
             for stage in dict.fromkeys(s for edge in told for s in edge["heard"]):
-                count = {
+                count: dict[str, Any] = {
                     kind: sum(edge[kind].get(stage, 0) for edge in told)
                     for kind in ("received", "late", "missed", "lost")
                 }
@@ -132,6 +153,7 @@ def _edges(
                     sent=sum(report.sent.get(stage, 0) for report in senders_lives),
                     recorded=None if recorder is None else recorder.by_key.get(f"{sender}/{stage}", 0),
                     **count,
+                    **of_edge(lives, total, sender, stage, count["received"]),
                 )
 
 
@@ -166,6 +188,11 @@ def _cpu(paces: Sequence[Mapping[str, Any]]) -> float | None:
     """Microseconds of CPU of a node's process for a step."""
     steps = sum(pace["completed"] for pace in paces)
     return round(1e6 * sum(pace["cpu_s"] for pace in paces) / steps, 1) if steps else None
+
+
+def _of_all_edges(lives: Iterable[NodeReport], kind: str) -> int:
+    """How many messages of all stages met with that."""
+    return sum(sum(edge.get(kind, {}).values()) for report in lives for edge in report.edges.values())
 
 
 def _quantiles(latencies: Iterable[Mapping[str, int]]) -> dict[str, float | None]:
@@ -267,6 +294,7 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
         missing = sum(summary["lost_on_recording"].values())
         console.print(f"recorded: {sum(recorded.values())} messages, {missing} missing")
     trouble = {name: summary[name] for name in ("lost", "late", "missed", "fallbacks", "skipped")}
+    trouble |= {f"late but {said}": summary[kind] for kind, said in LATE_FATES.items() if summary[kind]}
     console.print(", ".join(f"{count} {name}" for name, count in trouble.items()))
     if summary["refused"]:
         console.print("refused: " + ", ".join(f"{count} {reason}" for reason, count in summary["refused"].items()))
@@ -276,6 +304,8 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
             f"{summary['rounds_per_s']:.1f} steps/s; measurement to estimate "
             f"{latency['p50']:.0f} µs (p50), {latency['p99']:.0f} µs (p99)"
         )
+    _show_misfortune(console, summary)
+    show_latencies(console, summary, HEADINGS)
     holes = [edge for edge in summary["edges"] if edge["lost"] or edge["late"] or edge["missed"]]
     if holes:
         console.print("edges where something did not arrive in time:")
@@ -286,6 +316,34 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
             numbers = [str(edge[name]) for name in ("sent", "received", "late", "lost", "missed")]
             table.add_row(f"{edge['sender']} → {edge['receiver']}", edge["stage"], *numbers)
         console.print(table)
+
+
+def _show_misfortune(console: Console, summary: Mapping[str, Any]) -> None:
+    """What the scenario did to messages, nodes and links."""
+    total: Counter[str] = Counter()
+    for edge in summary["emulated"]:
+        total.update({reason: count for reason, count in edge.items() if isinstance(count, int)})
+    if total:
+        told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in total.items())
+        console.print(f"by the links of the scenario: {told}")
+    if summary["network"] and "edges" in summary["network"]:
+        _show_packets(console, summary["network"])
+    if summary["faults"]:
+        kinds = Counter(fault["kind"] for fault in summary["faults"])
+        told = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+        console.print(f"planned faults: {told}; {summary['restarts']} restarts")
+
+
+def _show_packets(console: Console, network: Mapping[str, Any]) -> None:
+    """What the network between the namespaces did to packets."""
+    total: Counter[str] = Counter({"strays": network["strays"], "overrun": network["overrun"]})
+    for edge in network["edges"]:
+        total.update({what: count for what, count in edge.items() if what not in {"from", "to", "bytes"}})
+    packets = total.pop("packets", 0)
+    dropped = "".join(f", {count} {what.replace('_', ' ')}" for what, count in total.items() if count)
+    late = network["late_us"]["p99"]
+    carried = "" if late is None else f"; carried up to {late:.0f} µs later than said (p99)"
+    console.print(f"network namespaces, {network['kind']}: {packets} packets{dropped}{carried}")
 
 
 def show_node_report(console: Console, report: Mapping[str, Any]) -> None:
