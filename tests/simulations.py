@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 
-from zfusion.drivers.links import Edge, Link, ideal
 from zfusion.drivers.simulated import Simulation, simulate
+from zfusion.links import Edge, Link
 from zfusion.messages import decode_any, encode_any
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import NodeId
@@ -59,13 +60,25 @@ def by_rule(rule: Callable[[Edge, Message], int | None]) -> Link:
     return link
 
 
-def record(path: Path, scenario: Scenario, link: Link = ideal) -> Path:
+def losing(probability: float, seed: int) -> Link:
+    """A link that loses each message with a probability, and delivers the others at once."""
+
+    def rule(edge: Edge, message: Message) -> int | None:
+        lost = Random(repr((seed, edge, message.stage, message.step))).random() < probability
+        return None if lost else 0
+
+    return by_rule(rule)
+
+
+def record(path: Path, scenario: Scenario, link: Link | None = None) -> Path:
     """The recording of a simulation."""
     simulate(scenario, run="r", output=path, link=link)
     return path
 
 
-def record_story(path: Path, scenario: Scenario, tell: Callable[[Simulation], None], link: Link = ideal) -> Simulation:
+def record_story(
+    path: Path, scenario: Scenario, tell: Callable[[Simulation], None], link: Link | None = None
+) -> Simulation:
     """The recording of a simulation in which something happens; `tell` runs it as far as it wants, then it ends."""
     with writer_for(path, scenario) as writer:
         simulation = Simulation(scenario, run="r", link=link, record=writer.write)

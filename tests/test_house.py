@@ -19,6 +19,7 @@ LAYERS = (
     ("node",),
     ("keys", "messages", "status"),
     ("recording",),
+    ("links",),
     ("drivers",),
     ("swarm",),
     ("studies",),
@@ -32,15 +33,18 @@ ONLY = {
     "zenoh": ("drivers/",),
     "mcap": ("recording/",),
     "msgpack": ("messages.py",),
-    "matplotlib": ("report/",),
+    "matplotlib": ("report/figures/",),
+    "jinja2": ("report/page.py",),
+    "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
-    "pydantic": ("model/schema/", "model/scenario.py"),
+    "pydantic": ("model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
+    "distributed": ("studies/experiment/engines.py",),
 }
 """Packages, and the only places that import them."""
 
 ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player"}
 
-NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py")
+NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py", "links/")
 
 
 def modules() -> Iterator[tuple[str, ast.Module]]:

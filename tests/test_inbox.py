@@ -12,8 +12,8 @@ import zenoh
 
 from swarms import wait_until
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.inbox import STRETCH_NS, Inbox, Wake
-from zfusion.drivers.transport import open_session
+from zfusion.drivers.inbox import POSTED, STRETCH_NS, Inbox, Letter, Wake
+from zfusion.drivers.transport import RECEIPT, open_session
 from zfusion.swarm.launch import free_endpoints
 
 SOON_NS = 20_000_000_000
@@ -47,9 +47,9 @@ class Pair:
         """The next message, however often the wait is ended by something else."""
         end = time.time_ns() + SOON_NS
         while time.time_ns() < end:
-            data = self.inbox.wait(name, end)
-            if data is not None:
-                return data
+            letter = self.inbox.wait(name, end)
+            if letter is not None:
+                return letter[0]
             self.inbox.notices.clear()
         pytest.fail(f"nothing came on {name}")
 
@@ -62,6 +62,11 @@ class Pair:
             self.session.close()
             self.peer.close()
         return time.monotonic() - began
+
+
+def payload(letter: Letter | None) -> bytes | None:
+    """What is in a letter."""
+    return None if letter is None else letter[0]
 
 
 @pytest.fixture
@@ -115,7 +120,7 @@ def test_a_notice_that_is_there_lets_nobody_wait(pair: Pair) -> None:
     assert pair.inbox.wait("a", None) is None
     assert not pair.inbox.rest(time.time_ns() + SOON_NS)
     pair.put("a", b"message")
-    wait_until(lambda: pair.inbox.wait("a", None) == b"message", "a message comes through all the same")
+    wait_until(lambda: payload(pair.inbox.wait("a", None)) == b"message", "a message comes through all the same")
 
 
 def test_rest_ends_with_its_time_or_a_notice(pair: Pair) -> None:
@@ -171,12 +176,12 @@ def test_nothing_is_lost_or_reordered_whatever_ends_the_waits(pair: Pair) -> Non
     while any(len(messages) < count for messages in heard.values()):
         assert time.monotonic() < end, {name: len(messages) for name, messages in heard.items()}
         turn += 1
-        data = pair.inbox.wait("ab"[turn % 2], time.time_ns() + turn % 5 * 100_000)
-        if data is not None:
-            heard["ab"[turn % 2]].append(data)
+        letter = pair.inbox.wait("ab"[turn % 2], time.time_ns() + turn % 5 * 100_000)
+        if letter is not None:
+            heard["ab"[turn % 2]].append(letter[0])
         pair.inbox.notices.clear()
         if turn % 7 == 0:
-            pair.inbox.drain(("a", "b"), lambda name, data: heard[name].append(data))
+            pair.inbox.drain(("a", "b"), lambda name, letter: heard[name].append(letter[0]))
     noise.set()
     for thread in threads:
         thread.join()
@@ -195,8 +200,8 @@ def test_a_full_channel_does_not_keep_another_one_waiting_for_ever(pair: Pair) -
     found = None
     while found is None:
         assert time.time_ns() < end
-        found = pair.inbox.wait("other", end)
-        pair.inbox.drain(["full"], lambda _, data: heard.append(data))
+        found = payload(pair.inbox.wait("other", end))
+        pair.inbox.drain(["full"], lambda _, letter: heard.append(letter[0]))
     assert found == b"behind"
     assert heard[:90] == [b"%d" % number for number in range(90)]
 
@@ -216,7 +221,7 @@ def test_an_expression_has_its_bell_on_a_key_of_its_own(pair: Pair) -> None:
     sample = pair.inbox.wait_sample("all", time.time_ns() + 1_000_000)
     assert str(sample.key_expr) == "test/bell"
     pair.put("x", b"message")
-    wait_until(lambda: pair.inbox.poll("all") == b"message", "a message")
+    wait_until(lambda: payload(pair.inbox.poll("all")) == b"message", "a message")
 
 
 def test_a_bell_does_not_leave_the_session(pair: Pair) -> None:
@@ -238,3 +243,50 @@ def test_a_wake_that_is_set_before_the_wait_ends_it_once() -> None:
     began = time.monotonic()
     wake.wait(0.02)
     assert time.monotonic() - began >= 0.02
+
+
+def test_a_letter_says_when_it_was_looked_at_and_if_its_sender_wants_when_it_came(pair: Pair) -> None:
+    pair.subscribe("a")
+    before = time.time_ns()
+    pair.put("a", b"plain")
+    pair.peer.put("test/a", b"stamped", timestamp_instrumentation=RECEIPT)
+    letters: list[Letter] = []
+    while len(letters) < 2:
+        assert time.time_ns() < before + SOON_NS
+        letter = pair.inbox.wait("a", before + SOON_NS)
+        letters += [] if letter is None else [letter]
+    (plain, looked, received), (stamped, looked_next, received_next) = letters
+    assert (plain, received, stamped) == (b"plain", None, b"stamped")
+    assert received_next is not None
+    assert before <= looked <= looked_next <= time.time_ns()
+    assert before <= received_next <= time.time_ns()
+
+
+def test_what_is_posted_comes_in_order_with_its_time_and_ends_a_rest_that_minds_it(pair: Pair) -> None:
+    for name in "ab":
+        pair.inbox.subscribe_posted(name, f"test/{name}")
+    pair.subscribe()
+    before = time.time_ns()
+    pair.put("a", b"one")
+    pair.put("b", b"two")
+    pair.put("a", b"three")
+    wait_until(lambda: len(pair.inbox.posted) == 3, "three messages")
+    assert not pair.inbox.rest(before + SOON_NS, or_posted=True)
+    assert [(source, data) for source, data, _ in pair.inbox.posted] == [("a", b"one"), ("b", b"two"), ("a", b"three")]
+    times = [at for *_, at in pair.inbox.posted]
+    assert before <= times[0] <= times[1] <= times[2] <= time.time_ns()
+    assert pair.inbox.rest(time.time_ns() + 1_000_000)  # who does not mind what is posted sleeps on
+    pair.inbox.posted.clear()
+    threading.Timer(0.05, pair.put, ("b", b"four")).start()
+    assert not pair.inbox.rest(before + SOON_NS, or_posted=True)
+
+
+def test_what_is_posted_does_not_fill_the_memory(pair: Pair) -> None:
+    pair.inbox.subscribe_posted("a", "test/a")
+    pair.subscribe()
+    pair.inbox.posted.extend([("a", b"", 0)] * (POSTED - 1))
+    pair.put("a", b"fits")
+    pair.put("a", b"does not")
+    wait_until(lambda: pair.inbox.overrun, "a message too many")
+    assert (len(pair.inbox.posted), pair.inbox.overrun) == (POSTED, 1)
+    assert pair.inbox.posted[-1][1] == b"fits"

@@ -15,7 +15,7 @@ from swarms import EXAMPLE, Result, estimates, launch, recorded, run_name, varia
 
 STEPS = 300
 NODES = ["1", "2", "3", "4"]
-STAGES = {"measurement", "intermediate", "estimate", "event", "truth"}
+STAGES = {"measurement", "intermediate", "estimate", "event", "arrivals", "truth"}
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,9 @@ def test_other_methods_run_live(directory: Path, method: str, stages: set[str], 
     summary = result.summary
     assert summary["method"] == method
     assert summary["completed_steps"] == dict.fromkeys(NODES, 50)
-    assert set(summary["messages"]["sent"]) == stages | {"estimate", "event", "truth"}
+    assert set(summary["messages"]["sent"]) == stages | {"estimate", "event", "truth"} | (
+        {"arrivals"} if edges else set()
+    )
     assert summary["messages"]["sent"] == summary["messages"]["recorded"]
     assert len(summary["edges"]) == edges
     assert summary["lost"] == 0

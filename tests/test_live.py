@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 import zenoh
 
@@ -27,6 +28,12 @@ from swarms import (
     variant,
     wait_until,
 )
+from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.transport import open_session
+from zfusion.messages import encode
+from zfusion.model.scenario import load_scenario
+from zfusion.stages import Message
+from zfusion.status import Phase, Status
 from zfusion.swarm.launch import free_endpoints
 
 NODES = (1, 2, 3, 4)
@@ -84,8 +91,9 @@ def test_the_keys_are_those_of_the_contract(outsider: Outsider) -> None:
     expected = {f"zfusion/{outsider.run}/node/{i}/{stage}" for i in NODES for stage in stages}
     assert expected | {f"zfusion/{outsider.run}/truth"} <= published
     assert published - expected <= {
-        f"zfusion/{outsider.run}/truth", *(f"zfusion/{outsider.run}/node/{i}/event" for i in NODES)
-    }  # fmt: skip
+        f"zfusion/{outsider.run}/truth",
+        *(f"zfusion/{outsider.run}/node/{i}/{stage}" for i in NODES for stage in ("event", "arrivals")),
+    }
 
 
 def test_encoding_and_time_stamps(outsider: Outsider) -> None:
@@ -176,7 +184,7 @@ def test_nodes_and_recorder_started_by_hand_make_a_swarm(directory: Path) -> Non
     recorded = recorder.wait()  # ends by itself when all have left
     assert recorded.code == 0, recorded.err
     assert recorded.summary["recorded"] == {
-        "measurement": 200, "intermediate": 200, "estimate": 200, "event": 4, "truth": 100
+        "measurement": 200, "intermediate": 200, "estimate": 200, "event": 4, "arrivals": 4, "truth": 100
     }  # fmt: skip
     assert recorded.summary["lost"] == {}
     assert len(estimates(path)) == 200
@@ -270,3 +278,38 @@ def test_a_zenoh_configuration_of_the_users_rules(directory: Path) -> None:
     result = broken.wait()
     assert result.code == 2
     assert "zenoh.json5" in result.error
+
+
+def test_a_node_that_is_behind_and_never_waits_still_answers(directory: Path) -> None:
+    """Whatever happens beside the messages is seen to between two steps, not only when there is nothing to do."""
+    scenario, run, steps = pair(directory, "behind", timing={"timeout_s": 60.0}), run_name("behind"), 12_000
+    loaded = load_scenario(scenario, free_run=True)
+    status = Status(2, loaded.fingerprint, Phase.RUNNING, step=1, born=1, epoch_ns=1, ready={})
+    said: dict[str, dict[str, object]] = {
+        "measurement": {"y": np.zeros(1)},
+        "intermediate": {"x": np.zeros(1), "used": (2,), "history": ((1, (2,)),)},
+    }
+    messages = [
+        (stage, encode(Message(2, step, stage, step - 1, 1, 1, fields)))
+        for step in range(2, steps)
+        for stage, fields in said.items()
+    ]
+    [command] = started_by_hand(directory, scenario, run, (1,), "--free-run", "--forever").values()
+    own = Endpoints(listen=(endpoints(scenario)["2"],), connect=(endpoints(scenario)["1"],))
+    with open_session(own) as session:
+        key = f"zfusion/{run}/node/2"
+        answering = session.declare_queryable(
+            f"{key}/status", lambda query: query.reply(f"{key}/status", status.encode())
+        )
+        token = session.liveliness().declare_token(key)
+        heard = Listener(session, f"zfusion/{run}/node/1/measurement")
+        wait_until(heard.collect, "node 1 begins")
+        for stage, data in messages:
+            session.put(f"{key}/{stage}", data, congestion_control=zenoh.CongestionControl.BLOCK)
+        [reply] = session.get(f"zfusion/{run}/node/1/status", zenoh.handlers.FifoChannel(10), timeout=60.0)
+        told = Status.decode(reply.ok.payload.to_bytes())
+        assert told.step < steps - 1, "it answered when it had nothing else to do"
+        answering.undeclare()
+        token.undeclare()
+    command.interrupt()
+    assert command.wait().code == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import sqrt
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -12,10 +11,10 @@ import pytest
 
 from oracles import brute_force
 from simulations import MS, by_rule, four_sensor, payloads, record, record_story, records, walk
-from zfusion.drivers.links import Dropping, Edge, ideal
 from zfusion.drivers.simulated import EPOCH_NS, FREE_STEP_NS, Simulation, simulate
 from zfusion.drivers.sources import TableSource
 from zfusion.errors import InputError
+from zfusion.links import Edge
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording import Recording
@@ -23,16 +22,17 @@ from zfusion.stages import Message
 
 
 def test_the_same_scenario_and_seed_give_the_same_recording(tmp_path: Path) -> None:
-    one = record(tmp_path / "1.mcap", walk(), Dropping(0.2, seed=1))
-    two = record(tmp_path / "2.mcap", walk(), Dropping(0.2, seed=1))
+    one = record(tmp_path / "1.mcap", walk(links={"loss": 0.2}))
+    two = record(tmp_path / "2.mcap", walk(links={"loss": 0.2}))
     assert records(one) == records(two)
 
 
-@pytest.mark.parametrize("seeds", [(4, 2), (5, 1)])
-def test_another_seed_gives_another(tmp_path: Path, seeds: tuple[int, int]) -> None:
-    one = record(tmp_path / "1.mcap", walk(), Dropping(0.2, seed=1))
-    two = record(tmp_path / "2.mcap", walk(seed=seeds[0]), Dropping(0.2, seed=seeds[1]))
-    assert records(one) != records(two)
+def test_another_seed_gives_another(tmp_path: Path) -> None:
+    one = record(tmp_path / "1.mcap", walk(links={"loss": 0.2}))
+    two = record(tmp_path / "2.mcap", walk(links={"loss": 0.2}, seed=5))
+    for stage in ("measurement", "intermediate"):
+        first, second = ([(p["node"], p.get("y"), p.get("used")) for p in payloads(path, stage)] for path in (one, two))
+        assert first != second
 
 
 def test_what_is_on_the_recording(tmp_path: Path) -> None:
@@ -43,6 +43,7 @@ def test_what_is_on_the_recording(tmp_path: Path) -> None:
         }
         assert {topic: n for topic, n in recording.topics.items() if "event" not in topic} == {
             **dict.fromkeys(topics, 7),
+            **{f"zfusion/r/node/{i}/arrivals": 1 for i in scenario.ids},
             "zfusion/r/truth": 7,
         }
         assert recording.complete
@@ -54,7 +55,9 @@ def test_what_is_on_the_recording(tmp_path: Path) -> None:
     events = payloads(tmp_path / "r.mcap", "event", 2)
     assert [event["kind"] for event in events] == ["started", "stopped"]
     assert events[0]["data"] == {"epoch_ns": EPOCH_NS}
-    assert events[1]["data"]["sent"] == {"event": 1, "measurement": 7, "intermediate": 7, "estimate": 7}
+    assert events[1]["data"]["sent"] == {
+        "event": 1, "measurement": 7, "intermediate": 7, "estimate": 7, "arrivals": 1
+    }  # fmt: skip
     assert events[1]["data"]["completed"] == 7
 
 
@@ -114,7 +117,7 @@ def test_order_and_time_of_arrival_change_no_bit_of_the_results(tmp_path: Path) 
 @pytest.mark.parametrize(("scenario", "loss"), [(four_sensor(7), 0.3), (walk(7), 0.3), (walk(5, names=True), 0.0)])
 def test_estimates_are_those_of_brute_force(tmp_path: Path, scenario: Scenario, loss: float) -> None:
     """Whatever was lost: the projection on what the messages say was used."""
-    path = record(tmp_path / "r.mcap", scenario, Dropping(loss, seed=8))
+    path = record(tmp_path / "r.mcap", scenario.with_overrides(loss=loss))
     stacked = brute_force.stack(scenario.system(), scenario.steps)
     measured = {(p["node"], p["step"]): np.array(p["y"]) for p in payloads(path, "measurement")}
     Y = stacked.vector(measured)
@@ -136,8 +139,8 @@ def test_estimates_are_those_of_brute_force(tmp_path: Path, scenario: Scenario, 
 
 
 def test_reports_count_what_happened() -> None:
-    scenario = walk(steps=40)
-    reports = simulate(scenario, run="r", link=Dropping(0.25, seed=2))
+    scenario = walk(steps=40, links={"loss": 0.25})
+    reports = simulate(scenario, run="r")
     lost = 0
     for i in scenario.ids:
         [report] = reports[i]
@@ -203,36 +206,6 @@ def test_free_running_nodes_wait_no_longer_than_their_timeout(tmp_path: Path) ->
     assert [p["t_ns"] - EPOCH_NS for p in payloads(path, "intermediate", 10)] == [500 * MS, 1500 * MS, 2500 * MS]
 
 
-def test_a_link_loses_with_its_probability() -> None:
-    message = Message(1, 1, "measurement", 0, 1, 0, {})
-    link, n, p = Dropping(0.3, seed=1), 4000, 0.3
-    lost = sum(not link((1, 2), message, 5) for _ in range(n))
-    assert abs(lost - n * p) < 6 * sqrt(n * p * (1 - p))
-    assert Dropping(0.0, seed=1)((1, 2), message, 5) == (5,)
-    assert Dropping(1.0, seed=1)((1, 2), message, 5) == ()
-
-
-def test_losses_on_one_edge_do_not_depend_on_another() -> None:
-    message = Message(1, 1, "measurement", 0, 1, 0, {})
-
-    def losses(link: Dropping, also: bool) -> list[bool]:
-        lost = []
-        for _ in range(300):
-            lost.append(not link((1, 2), message, 0))
-            if also:
-                link((2, 1), message, 0)
-        return lost
-
-    assert losses(Dropping(0.5, seed=1), also=True) == losses(Dropping(0.5, seed=1), also=False)
-    assert losses(Dropping(0.5, seed=1), also=False) != losses(Dropping(0.5, seed=2), also=False)
-
-
-@pytest.mark.parametrize("probability", [-0.1, 1.1, float("nan")])
-def test_a_probability_that_is_none(probability: float) -> None:
-    with pytest.raises(InputError, match="from 0 to 1"):
-        Dropping(probability, seed=1)
-
-
 def test_a_source_that_exists_in_a_live_run_only() -> None:
     with pytest.raises(InputError, match="live run"):
         simulate(walk(source={"kind": "zenoh", "key": "my/{id}"}), run="r")
@@ -254,5 +227,5 @@ def test_many_nodes() -> None:
     ids: list[NodeId] = list(range(48))
     sensors = [{"ids": ids, "H": [[1.0, 0.0]], "R": [[0.5]]}]
     scenario = walk(steps=3, sensors=sensors, network={"generator": "ring", "reach": 2})
-    reports = simulate(scenario, run="r", link=ideal)
+    reports = simulate(scenario, run="r")
     assert [reports[i][0].completed for i in ids] == [3] * 48

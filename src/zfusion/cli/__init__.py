@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import library, live, models, recordings
+from zfusion.cli import compare, experiment, library, live, models, recordings, report
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -33,11 +33,16 @@ for command in (
     live.node,
     live.record,
     models.design,
+    compare.compare,
+    compare.worst,
+    experiment.experiment,
     recordings.replay,
     recordings.info,
     recordings.export,
+    report.report,
 ):
     app.command()(command)
+app.command(hidden=True)(live.network)
 app.add_typer(library.app, name="library")
 
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from zfusion.errors import InputError, Problem, ScenarioError, ZfusionError
+from zfusion.errors import InputError, ZfusionError
 from zfusion.keys import check_run
-from zfusion.methods import METHODS
-from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.methods.check import check_method
+from zfusion.model.scenario import Overrides, Scenario, load_scenario
 from zfusion.model.types import NodeId
 
 err = Console(stderr=True, highlight=False)
@@ -32,6 +32,14 @@ FreeRun = Annotated[bool, typer.Option("--free-run", help="Each step as soon as 
 MethodName = Annotated[
     str | None, typer.Option("--method", help="two_stage, local or centralized.", show_default="the scenario's")
 ]
+Links = Annotated[
+    Path | None,
+    typer.Option("--links", help="File of [links] and [[faults]] (TOML).", show_default="the scenario's"),
+]
+Loss = Annotated[
+    float | None,
+    typer.Option(help="Probability that a message is lost on a link.", min=0, max=1, show_default="the scenario's"),
+]
 RunName = Annotated[str | None, typer.Option("--run", help="Name of the run.", show_default="made up")]
 Connect = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to dial; may be repeated.")]
 Listen = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on; may be repeated.")]
@@ -45,31 +53,32 @@ def load(
     free_run: bool = False,
     seed: int | None = None,
     method: str | None = None,
+    links: Path | None = None,
+    loss: float | None = None,
+    delay: float | None = None,
 ) -> Scenario:
-    """The scenario of a file with what the command line says instead; ScenarioError for what is wrong with it."""
-    loaded = load_scenario(
-        path, steps=steps, rate_hz=rate, free_run=True if free_run else None, seed=seed, method=method
+    """The scenario of a file with what the command line says instead; InputError for what is wrong with it.
+
+    Says so where a fault is planned for steps that are not taken.
+    """
+    from zfusion.links import Timeline, links_of
+
+    overrides = Overrides(
+        steps=steps,
+        rate_hz=rate,
+        free_run=True if free_run else None,
+        seed=seed,
+        method=method,
+        links=links,
+        loss=loss,
+        delay=delay,
     )
+    loaded = load_scenario(path, **overrides)
     check_method(loaded, str(path))
+    links_of(loaded)
+    for n in Timeline(loaded).beyond(loaded.steps):
+        err.print(f"faults[{n}] begins after the last step, {loaded.steps}: it will not happen")
     return loaded
-
-
-def check_method(scenario: Scenario, source: str) -> None:
-    """ScenarioError unless there is such a method, with such stages and options."""
-    problems = []
-    if scenario.method.name not in METHODS:
-        problems.append(Problem("method", scenario.method.name, f"expected one of {', '.join(METHODS)}"))
-    else:
-        stages = [stage.name for method in METHODS.values() for stage in method.stages]
-        known = ", ".join(dict.fromkeys(stages))
-        for stage, fraction in scenario.timing.deadlines.items():
-            if stage not in stages:
-                problems.append(Problem(f"timing.deadlines.{stage}", fraction, f"expected a stage: {known}"))
-        for option, value in scenario.method.options.items():
-            expected = f"the method {scenario.method.name} has no options"
-            problems.append(Problem(f"method.options.{option}", value, expected))
-    if problems:
-        raise ScenarioError(source, problems)
 
 
 def run_name(given: str | None, scenario: Scenario) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -13,7 +13,9 @@ from zfusion.cli.common import (
     ControlFd,
     FreeRun,
     Json,
+    Links,
     Listen,
+    Loss,
     MethodName,
     Rate,
     RunName,
@@ -35,7 +37,10 @@ from zfusion.cli.common import (
     recording_path,
     run_name,
 )
+from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
+
+NetnsKind = Literal["tun", "netem"]
 
 
 def launch(
@@ -45,28 +50,42 @@ def launch(
     free_run: FreeRun = False,
     seed: Seed = None,
     method: MethodName = None,
+    links: Links = None,
+    loss: Loss = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
     ] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
     restart: Annotated[bool, typer.Option("--restart", help="Start a node that dies again.")] = False,
+    netns: Annotated[bool, typer.Option("--netns", help="Every node in a network namespace of its own.")] = False,
+    netns_with: Annotated[
+        NetnsKind | None,
+        typer.Option(help="What joins them; implies --netns.", show_default="netem where it is, or tun"),
+    ] = None,
     run: RunName = None,
     as_json: Json = False,
 ) -> None:
     """Run a swarm on this machine: a process for every node, and the recorder."""
     from zfusion.report.summary import show_summary
 
-    loaded = load(scenario, steps, rate, free_run, seed, method)
+    loaded = load(scenario, steps, rate, free_run, seed, method, links, loss)
     name = run_name(run, loaded)
     recording = recording_path(loaded, name, record, no_record)
-    summary = launched(loaded, name, recording, restart=restart, quiet=as_json)
+    joined = netns_with or ("auto" if netns else None)
+    summary = launched(loaded, name, recording, restart=restart, netns=joined, quiet=as_json)
     finish(summary, as_json, lambda: show_summary(out, summary))
     if summary["failures"]:
         raise typer.Exit(1)
 
 
 def launched(
-    scenario: Scenario, run: str, recording: Path | None, *, restart: bool = False, quiet: bool = False
+    scenario: Scenario,
+    run: str,
+    recording: Path | None,
+    *,
+    restart: bool = False,
+    netns: str | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Launch a swarm, show how it goes unless `quiet`, and summarise it."""
     from zfusion.report.summary import summarize
@@ -76,7 +95,7 @@ def launched(
     directory = recording.parent if recording is not None else default_directory(scenario)
     logs = directory / f"{run}.logs"
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
-        options = LaunchOptions(run, logs, recording, restart, on_update=table.update, on_message=table.message)
+        options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -88,6 +107,7 @@ def launched(
         failures=result.failures,
         interrupted=result.interrupted,
         logs=str(result.logs),
+        network=result.network,
     )
 
 
@@ -98,7 +118,8 @@ def simulate(
     free_run: FreeRun = False,
     seed: Seed = None,
     method: MethodName = None,
-    loss: Annotated[float, typer.Option(help="Probability that a message is lost on an edge.", min=0, max=1)] = 0.0,
+    links: Links = None,
+    loss: Loss = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
     ] = None,
@@ -107,18 +128,16 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Run the same swarm in virtual time: same nodes, same recording, same summary."""
-    from zfusion.drivers.links import Dropping, ideal
     from zfusion.drivers.metrics import RecorderReport
     from zfusion.drivers.simulated import simulate as run_simulation
     from zfusion.recording import Recording
     from zfusion.report.summary import show_summary, summarize
 
-    loaded = load(scenario, steps, rate, free_run, seed, method)
+    loaded = load(scenario, steps, rate, free_run, seed, method, links, loss)
     name = run_name(run, loaded)
     path = recording_path(loaded, name, record, no_record)
-    link = Dropping(loss, loaded.seed) if loss else ideal
     with err.status(f"simulating {loaded.steps} steps of {len(loaded.ids)} nodes"):
-        reports = run_simulation(loaded, run=name, output=path, link=link)
+        reports = run_simulation(loaded, run=name, output=path)
     recorded = None
     if path is not None:
         with Recording.open(path) as recording:
@@ -141,6 +160,9 @@ def node(
     epoch: Annotated[str | None, typer.Option(help="When step 0 is (RFC 3339).", show_default="agreed on")] = None,
     await_recorder: Annotated[bool, typer.Option(help="Begin only when a recorder is there.")] = False,
     forever: Annotated[bool, typer.Option("--forever", help="Take steps until stopped.")] = False,
+    emulation: Annotated[
+        bool, typer.Option("--emulation/--no-emulation", help="Do to messages what the scenario's links say.")
+    ] = True,
     as_json: Json = False,
     control_fd: ControlFd = None,
 ) -> None:
@@ -159,9 +181,15 @@ def node(
             recorder=await_recorder,
             epoch_ns=None if epoch is None else epoch_ns(epoch),
             steps=None if forever else loaded.steps,
+            emulate=emulation,
         )
         tell = None if control is None else lambda status: control.tell(status=plain(asdict(status)))
-        live = LiveNode(loaded, own, options, tell)
+
+        def announce(blow: Any) -> None:
+            """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
+            control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
+
+        live = LiveNode(loaded, own, options, tell, None if control is None else announce)
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
@@ -178,6 +206,7 @@ def record(
     run: RunName = None,
     connect: Connect = None,
     listen: Listen = None,
+    network: Annotated[NetnsKind | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
     control_fd: ControlFd = None,
 ) -> None:
@@ -200,6 +229,7 @@ def record(
             method=method,
             seed=loaded.seed,
             stages=METHODS[method].stages,
+            facts=None if network is None else {"network": network},
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))
         recorder = Recorder(
@@ -213,3 +243,23 @@ def record(
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+
+
+def network(
+    scenario: ScenarioFile,
+    run: RunName = None,  # noqa: ARG001 - for whoever looks at the processes
+    kind: Annotated[NetnsKind | None, typer.Option()] = None,
+    control_fd: ControlFd = None,
+) -> None:
+    """The network between the namespaces of a swarm's nodes; for `launch --netns`."""
+    from zfusion.swarm.netns.network import Network
+
+    control = control_of(control_fd, deadly=True)
+    if control is None:
+        raise InputError("the network between namespaces is started by launch --netns")
+    with ToldTo(control):
+        joined = Network(load_scenario(scenario), kind)
+        control.on_stop(joined.stop, joined.hear)
+        control.tell(status=joined.status())
+        joined.carry()
+        control.tell(report=joined.report())

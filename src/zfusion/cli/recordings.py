@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,17 +15,18 @@ from zfusion.cli.common import (
     Connect,
     Json,
     Listen,
+    Loss,
     MethodName,
     RecordingFile,
     RunName,
     Seed,
-    check_method,
     err,
     finish,
     load,
     on_signals,
     out,
 )
+from zfusion.methods.check import check_method
 from zfusion.model.scenario import Overrides, Scenario
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
 
 WORTH_PROCESSES = 100_000
 """Messages from which on verifying is shared among the machine's cores: starting their processes takes a second."""
+
+RECORDED = "recorded"
+"""In the place of a file of links: those that the recording itself measured."""
 
 POLL_S = 0.02
 """How often a player that waits for a consumer looks for one."""
@@ -54,9 +59,19 @@ def replay(
     scenario: Annotated[
         Path | None, typer.Option(help="Run the measurements through this scenario.", show_default="the recorded one")
     ] = None,
-    loss: Annotated[
-        float, typer.Option(help="Probability that a message is lost, when run again.", min=0, max=1)
-    ] = 0.0,
+    links: Annotated[
+        str | None,
+        typer.Option(
+            help="File of [links] and [[faults]], or 'recorded': the latencies that were measured.",
+            show_default="the scenario's",
+        ),
+    ] = None,
+    loss: Loss = None,
+    late: Annotated[
+        str | None,
+        typer.Option(help="What becomes of late messages: drop, revise, wait.", show_default="the scenario's"),
+    ] = None,
+    window: Annotated[int | None, typer.Option(help="Steps that they may be late, if revised.", min=1)] = None,
     seed: Seed = None,
     speed: Annotated[float, typer.Option(help="How many times as fast; 0: as fast as possible.", min=0)] = 1.0,
     start: Annotated[float | None, typer.Option(help="Seconds from the beginning to start at.", min=0)] = None,
@@ -87,7 +102,10 @@ def replay(
         if verify:
             _verify(opened, as_json)
         elif output is not None:
-            _rerun(opened, output, scenario, Overrides(method=method, seed=seed), loss, run, as_json)
+            given = {"timing.late": late, "timing.window": window}
+            settings = {path: value for path, value in given.items() if value is not None}
+            other = _other(opened, scenario, links, Overrides(method=method, seed=seed, loss=loss), settings)
+            _rerun(opened, other, output, run, as_json)
         else:
             extent = Extent(start, end, first_step, last_step)
             chosen = (node, stage, topic)
@@ -106,27 +124,31 @@ def _verify(recording: Recording, as_json: bool) -> None:
         raise typer.Exit(1)
 
 
-def _rerun(
-    recording: Recording,
-    output: Path,
-    scenario: Path | None,
-    overrides: Overrides,
-    loss: float,
-    run: str | None,
-    as_json: bool,
-) -> None:
-    from zfusion.drivers.links import Dropping, ideal
+def _other(
+    recording: Recording, scenario: Path | None, links: str | None, overrides: Overrides, settings: Mapping[str, Any]
+) -> Scenario:
+    """What the measurements are to be run through: the recorded scenario or another one, changed as is said."""
     from zfusion.drivers.replayed import recorded_scenario
+    from zfusion.drivers.rerun import with_recorded_links
+    from zfusion.studies.settings import with_settings
+
+    other: Scenario = load(scenario) if scenario is not None else recorded_scenario(recording)
+    if links == RECORDED:
+        other = with_recorded_links(other, recording)
+    elif links is not None:
+        overrides["links"] = links
+    other = with_settings(other.with_overrides(**overrides), settings, str(scenario or recording.path))
+    check_method(other, str(scenario or recording.path))
+    return other
+
+
+def _rerun(recording: Recording, other: Scenario, output: Path, run: str | None, as_json: bool) -> None:
     from zfusion.drivers.rerun import rerun
     from zfusion.report.replay import show_rerun
 
-    other: Scenario = load(scenario) if scenario is not None else recorded_scenario(recording)
-    other = other.with_overrides(**overrides)
-    check_method(other, str(scenario or recording.path))
-    link = Dropping(loss, other.seed) if loss else ideal
     output.parent.mkdir(parents=True, exist_ok=True)
     with err.status("running the measurements again"):
-        done = rerun(recording, other, output, link=link, run=run)
+        done = rerun(recording, other, output, run=run)
     finish({"recording": str(output), "nodes": done.as_dict()}, as_json, lambda: show_rerun(out, done, output))
 
 
