@@ -30,6 +30,9 @@ from zfusion.stages import ESTIMATE, Message
 FREE_STEP_NS = 1_000_000
 """The shortest step of a free-running node, 1 ms, so that time goes on although computing takes none of it."""
 
+ONE_CLOCK = {"offset_us": 0.0, "uncertainty_us": 0.0}
+"""What there is between two clocks where nobody has set one wrong: they show the virtual time."""
+
 Record = Callable[[str, bytes, int], None]
 """(key, payload, time) of every message, in order."""
 
@@ -120,6 +123,9 @@ class Simulation:
         if isinstance(self._link, LinkNetwork):
             for (sender, receiver), counter in self._link.counters.items():
                 reports[receiver][-1].emulated[str(sender)] = dict(counter)
+        if not any(fault.kind == "clock" for fault in self._scenario.faults):
+            for report in (report for of_node in reports.values() for report in of_node):
+                report.clocks = dict.fromkeys(report.edges, ONE_CLOCK)
         return reports
 
     @property

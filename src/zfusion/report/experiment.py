@@ -66,6 +66,8 @@ def show_outcome(console: Console, outcome: Outcome, report: Path | None) -> Non
         f"{outcome.runs} runs of {outcome.points} points: {outcome.done} done in {outcome.elapsed_s:.1f} s, "
         f"{outcome.reused} done before" + (f", {missing} missing" if missing else "")
     )
+    if outcome.headlines and not _any(outcome, "fallbacks"):
+        console.print("0 fallbacks: no neighbour's estimate was left out because its history was unknown")
     for failure in outcome.failed[:SHOWN_FAILURES]:
         seed = "" if failure["seed"] is None else f", seed {failure['seed']}"
         told = escape(f"{failure['point']}{seed}: {failure['error']}")
@@ -79,19 +81,25 @@ def show_outcome(console: Console, outcome: Outcome, report: Path | None) -> Non
 
 
 def _table(outcome: Outcome) -> Table:
-    table = Table(title="final estimates, mean over the seeds", title_justify="left")
+    table = Table(title="final estimates, mean over the seeds", title_justify="left", padding=(0, 1, 0, 0))
     for path in outcome.headlines[0]["labels"]:
-        table.add_column(path.rpartition(".")[2])
-    for heading in SHOWN.values():
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(path.rpartition(".")[2], overflow="fold")
+    shown = [name for name in SHOWN if name != "fallbacks" or _any(outcome, name)]
+    for name in shown:
+        table.add_column(SHOWN[name], justify="right", no_wrap=True)
     for headline in outcome.headlines[:SHOWN_POINTS]:
-        cells = [_interval(headline["metrics"].get(name)) for name in SHOWN]
+        cells = [_interval(headline["metrics"].get(name)) for name in shown]
         table.add_row(*(escape(str(label)) for label in headline["labels"].values()), *cells)
     return table
+
+
+def _any(outcome: Outcome, metric: str) -> bool:
+    """Whether there was any of it at all."""
+    return any((headline["metrics"].get(metric) or [None])[0] for headline in outcome.headlines)
 
 
 def _interval(told: Sequence[float | None] | None) -> str:
     if told is None or told[0] is None:
         return "-"
     mean, low, high = told
-    return f"{mean:.4g}" if low is None or high is None or low == high else f"{mean:.4g} ± {(high - low) / 2:.2g}"
+    return f"{mean:.3g}" if low is None or high is None or low == high else f"{mean:.3g} ± {(high - low) / 2:.1g}"

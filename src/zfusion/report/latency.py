@@ -26,6 +26,15 @@ SHOWN = {
 }
 """Parts of a budget that differ between edges, and their headings."""
 
+MEANING = {
+    "behind": "not sent yet",
+    "injected": "by link emulation",
+    "queued": "there, not looked at",
+    "waited": "for the slowest",
+    "missing": "nothing came",
+}
+"""What is not plain from its heading."""
+
 
 def of_edge(
     lives: Sequence[NodeReport], total: Mapping[str, Any], sender: str, stage: str, used: int
@@ -101,6 +110,8 @@ def show_latencies(console: Console, summary: Mapping[str, Any], headings: Mappi
     more = f" ({MOST_SHOWN} slowest of {len(edges)})" if len(edges) > MOST_SHOWN else ""
     console.print(f"latency, and what a stage's time goes into, in µs{more}:")
     console.print(table)
+    meaning = [f"{SHOWN[part]}: {MEANING[part]}" for part in parts if part in MEANING]
+    console.print(f"({'; '.join(meaning)})", style="dim")
 
 
 def _clock(lives: Sequence[NodeReport], sender: str) -> dict[str, float]:
