@@ -31,14 +31,15 @@ def run_small(name: str, directory: Path) -> Means:
 
 
 def test_latency(tmp_path: Path) -> None:
-    by_point = run_small("latency", tmp_path)
-    found = {(median, late): of for (median, late, *_), of in by_point.items()}
-    assert len(found) == len(by_point) == 6
+    found = run_small("latency", tmp_path)
+    assert len(found) == 10
     for policy in ("drop", "revise"):
-        fast, slow = found["0.001", policy], found["0.02", policy]
+        fast, slow = found["0.001", policy, "0.45"], found["0.02", policy, "0.45"]
         assert fast["measurement used_fraction"] > 0.9 > slow["measurement used_fraction"]
+        assert slow["measurement used_fraction"] > found["0.02", policy, "0.2"]["measurement used_fraction"]
         assert fast["estimate predicted_mse"] < slow["estimate predicted_mse"]
-    drop, revise, wait = (found["0.02", policy] for policy in ("drop", "revise", "wait"))
+    drop, revise = (found["0.02", policy, "0.45"] for policy in ("drop", "revise"))
+    wait = found["0.02", "wait", "none"]
     assert revise["measurement revised"] > 0 == drop["measurement revised"]
     assert wait["estimate predicted_mse"] < revise["estimate predicted_mse"] < drop["estimate predicted_mse"]
     assert wait["measurement used_fraction"] == 1

@@ -86,6 +86,17 @@ def test_maps_of_pairs_of_numbers(results: Results) -> None:
     assert np.allclose(image, [[rmse_of({DELAY: d, LOSS: p, LATE: "drop"}) for d in AXES[DELAY]] for p in AXES[LOSS]])
 
 
+def test_labels_that_are_numbers_make_a_map_and_others_are_left_out_of_it(tmp_path: Path) -> None:
+    found = Results(experiment(tmp_path / "e", {DELAY: [0.0, 0.01], "timing.deadlines": ["0.2", "none", "0.1"]}))
+    measure = error_measure(found)
+    assert measure is not None
+    [picture] = heat_maps(found, measure)
+    labels = [{DELAY: d, "timing.deadlines": deadline} for deadline in ("0.1", "0.2") for d in (0.0, 0.01)]
+    image = picture.figure.axes[0].images[0].get_array()
+    assert np.allclose(image.ravel(), [rmse_of(of_point) for of_point in labels])
+    assert "Conditions to which no number belongs are left out" in picture.text
+
+
 def test_errors_over_time_beside_the_prediction(results: Results) -> None:
     picture = errors_over_time(results)
     assert picture is not None

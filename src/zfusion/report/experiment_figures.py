@@ -269,14 +269,16 @@ def _groups(points: Sequence[Point], split: Sequence[Axis]) -> Iterator[tuple[st
 
 
 def heat_maps(results: Results, measure: Measure) -> Iterator[Picture]:
-    """The measure over every pair of numeric axes."""
-    numeric = [a for a in results.axes if a.numeric][:MOST_AXES]
-    for x_axis, y_axis in combinations(numeric, 2):
+    """The measure over every pair of axes whose values are numbers, or some of whose labels are."""
+    scales = [a for a in results.axes if len(_numbers(a)) > 1][:MOST_AXES]
+    for x_axis, y_axis in combinations(scales, 2):
         split = [a for a in results.axes if a not in (x_axis, y_axis)]
-        groups = [*_groups(results.points, split)]
-        maps = [_map(title, points, x_axis, y_axis, measure.values) for title, points in groups[:MOST_PANELS]]
-        x, y = (axis(a.path, [float(label) for label in a.labels]) for a in (x_axis, y_axis))
+        points = [p for p in results.points if all(_number(p.labels[a.path]) is not None for a in (x_axis, y_axis))]
+        groups = [*_groups(points, split)]
+        maps = [_map(title, group, x_axis, y_axis, measure.values) for title, group in groups[:MOST_PANELS]]
+        x, y = (axis(a.path, _numbers(a)) for a in (x_axis, y_axis))
         more = f" {len(groups) - MOST_PANELS} more maps are not drawn." if len(groups) > MOST_PANELS else ""
+        more += " Conditions to which no number belongs are left out." if len(points) < len(results.points) else ""
         yield Picture(
             f"{measure.name}-map-{_file_name(x_axis.path)}-{_file_name(y_axis.path)}",
             f"{measure.title} over {x.name} and {y.name}",
@@ -286,11 +288,25 @@ def heat_maps(results: Results, measure: Measure) -> Iterator[Picture]:
         )
 
 
+def _number(label: object) -> float | None:
+    """What number a label is, None if it is none."""
+    try:
+        return float(str(label))
+    except ValueError:
+        return None
+
+
+def _numbers(of: Axis) -> list[float]:
+    return [number for number in map(_number, of.labels) if number is not None]
+
+
 def _map(title: str, points: Sequence[Point], x_axis: Axis, y_axis: Axis, values: Values) -> heat_map.Map:
-    x, y = (np.array(sorted(float(label) for label in a.labels)) for a in (x_axis, y_axis))
+    x, y = (np.array(sorted(_numbers(a))) for a in (x_axis, y_axis))
     cells = np.full((len(y), len(x)), math.nan)
     for point in points:
-        row, column = (int(np.searchsorted(of, float(point.labels[a.path]))) for of, a in ((y, y_axis), (x, x_axis)))
+        row, column = (
+            int(np.searchsorted(of, float(str(point.labels[a.path])))) for of, a in ((y, y_axis), (x, x_axis))
+        )
         cells[row, column] = values.get(point.number, NOTHING).mean
     return heat_map.Map(title, x, y, cells)
 
