@@ -94,7 +94,7 @@ def test_labels_that_are_numbers_make_a_map_and_others_are_left_out_of_it(tmp_pa
     labels = [{DELAY: d, "timing.deadlines": deadline} for deadline in ("0.1", "0.2") for d in (0.0, 0.01)]
     image = picture.figure.axes[0].images[0].get_array()
     assert np.allclose(image.ravel(), [rmse_of(of_point) for of_point in labels])
-    assert "Conditions to which no number belongs are left out" in picture.text
+    assert "Conditions to which no number belongs are left out" in picture.reading
 
 
 def test_errors_over_time_beside_the_prediction(results: Results) -> None:
