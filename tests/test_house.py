@@ -39,6 +39,8 @@ ONLY = {
     "typer": ("cli.py", "cli/"),
     "pydantic": ("model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
     "distributed": ("studies/experiment/engines.py",),
+    "cvxpy": ("methods/convex.py",),
+    "scipy": ("methods/convex.py",),
 }
 """Packages, and the only places that import them."""
 

@@ -1,0 +1,221 @@
+"""A design of the method `stationary`: made off-line, checked against its own promise, kept in a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from zfusion.methods import design_files
+from zfusion.methods.convex import DesignError
+from zfusion.methods.stationary.cost import Cost, Gains, evaluate, rescaled
+from zfusion.methods.stationary.limits import centralized_mse, information_limit, local_predictors, neighbourhood_mse
+from zfusion.methods.stationary.lmi import Choice
+from zfusion.methods.stationary.lmi import design as convex_design
+from zfusion.methods.stationary.problem import Plant, Problem
+from zfusion.methods.stationary.refine import refine as refine_gains
+from zfusion.model.types import Array, NodeId, sorted_ids
+
+METHOD = "stationary"
+
+LARGEST_CONVEX = 40
+"""n nx up to which the convex design takes minutes at most; beyond it descends from the local predictors."""
+
+TOLERANCE = 1e-5
+"""By how much of itself a cost may exceed its bound: what the solver's own accuracy makes of a tight one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """The gains of all nodes, what was promised, and what they really do.
+
+    What no convex design was made for has no bound; what is no descent has no iterations.
+    """
+
+    ids: tuple[NodeId, ...]
+    """The nodes, sorted: the order of all rows and columns."""
+    problem: Problem
+    gains: Gains
+    J: float
+    """The weighted sum of the mean squared errors; for a polytope, the largest of its vertices."""
+    mse: Array
+    """Of each node, (n,), at the first vertex."""
+    information_limit: Array
+    """What no estimator of this structure can beat, (n,), at the first vertex."""
+    neighbourhood_mse: Array
+    """Of the Kalman predictors with the neighbourhoods' measurements, (n,)."""
+    centralized_mse: float
+    """Of the Kalman predictor with all measurements."""
+    bound: float | None = None
+    """Of J, certified; after a descent on a polytope none."""
+    node_bounds: Array | None = None
+    """Of each node's mean squared error, (n,), certified by the controllability design; after a descent none."""
+    solver: str = ""
+    """Which one, and its verdict."""
+    solver_seconds: float = 0.0
+    """What it said that it took."""
+    iterations: int = 0
+    """Of the descent."""
+
+    def edge(self, receiver: NodeId, sender: NodeId) -> tuple[Array, Array, Array]:
+        """F_ij (nx, nx), G_ij (nx, p_j), H_ij (nx, nx); ValueError for an unknown node."""
+        i, j, plant = self.ids.index(receiver), self.ids.index(sender), self.problem.nominal
+        end = int(np.cumsum(plant.ny)[j])
+        rows, states = slice(i * plant.nx, (i + 1) * plant.nx), slice(j * plant.nx, (j + 1) * plant.nx)
+        F, G, H = self.gains
+        return F[rows, states], G[rows, end - plant.ny[j] : end], H[rows, states]
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the problem that it solves: the system, the graph and the weights."""
+        return fingerprint(self.ids, self.problem)
+
+    def save(self, path: Path) -> None:
+        """Write it as an .npz archive; InputError where that cannot be done."""
+        arrays: dict[str, Any] = {
+            "ids": design_files.stored_ids(self.ids),
+            **self.gains._asdict(),
+            **_stored(self.problem),
+        }
+        for name in SCALARS:
+            arrays[name] = getattr(self, name)
+        for name in OPTIONAL:
+            if (value := getattr(self, name)) is not None:
+                arrays[name] = value
+        design_files.save(path, METHOD, self.fingerprint, arrays)
+
+    @classmethod
+    def load(cls, path: Path, made_for: str | None = None) -> Self:
+        """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
+        arrays: dict[str, Any] = design_files.load(path, METHOD, made_for)
+        gains = Gains(arrays["F"], arrays["G"], arrays["H"])
+        told = {name: arrays[name].tolist() if arrays[name].ndim == 0 else arrays[name] for name in SCALARS}
+        told |= {
+            name: arrays[name].tolist() if arrays[name].ndim == 0 else arrays[name]
+            for name in OPTIONAL
+            if name in arrays
+        }
+        return cls(tuple(arrays["ids"].tolist()), _restored(arrays), gains, **told)
+
+
+SCALARS = (
+    "J",
+    "mse",
+    "information_limit",
+    "neighbourhood_mse",
+    "centralized_mse",
+    "solver",
+    "solver_seconds",
+    "iterations",
+)
+OPTIONAL = ("bound", "node_bounds")
+
+
+def make_design(
+    ids: tuple[NodeId, ...],
+    problem: Problem,
+    choice: Choice | None = None,
+    *,
+    convex: bool | None = None,
+    refine: bool | None = None,
+) -> Design:
+    """Design the network: by linear matrix inequalities, by descent on the true cost, or by one after the other.
+
+    `convex` is by default whether n nx <= LARGEST_CONVEX; without it the descent begins at the local predictors.
+    `refine` is by default what `convex` is not. A descent reaches the information limit or nearly so, but it uses up
+    what makes the convex designs bear losses (`losses.under_loss`), and on a polytope it has no certificate.
+
+    DesignError where it is infeasible or breaks its promise; InputError without the packages it needs.
+    """
+    if list(ids) != sorted_ids(ids) or len(ids) != problem.nominal.n:
+        raise ValueError(f"expected {problem.nominal.n} ids in sorted order: {ids}")
+    choice = Choice() if choice is None else choice
+    convex = problem.size <= LARGEST_CONVEX if convex is None else convex
+    refine = not convex if refine is None else refine
+    promised: dict[str, Any] = {}
+    if convex:
+        designed = convex_design(problem, choice)
+        gains, worst = designed.gains, _worst(problem, designed.gains)
+        _check_promise(worst.J, designed.bound)
+        if not choice.observer:
+            gains = rescaled(problem, gains, evaluate(problem, gains).P)
+        promised = {
+            "bound": designed.bound,
+            "node_bounds": designed.node_bounds,
+            "solver_seconds": designed.solved.seconds,
+        }
+        promised["solver"] = f"{designed.solved.solver}: {designed.solved.status}"
+    else:
+        gains = local_predictors(problem)
+        worst = _worst(problem, gains)
+    if refine:
+        refined = refine_gains(problem, gains)
+        candidate = _worst(problem, refined.gains)
+        if candidate.J < worst.J:
+            gains = rescaled(problem, refined.gains, evaluate(problem, refined.gains).P)
+            promised |= {"iterations": refined.iterations, "node_bounds": None}
+            if len(problem.vertices) > 1:
+                promised["bound"] = None
+    return _told(ids, problem, gains, promised)
+
+
+def fingerprint(ids: tuple[NodeId, ...], problem: Problem) -> str:
+    """Of a problem: what a design file must have been made for."""
+    parts: list[tuple[str, object]] = [("ids", str(ids)), ("weights", problem.weights)]
+    parts += [(name, getattr(problem, name)) for name in ("F", "G", "H")]
+    for plant in problem.vertices:
+        parts += [("A", plant.A), ("C", plant.stacked_C), ("Q", plant.Q), ("R", plant.R)]
+    return design_files.fingerprint(parts)
+
+
+def _told(ids: tuple[NodeId, ...], problem: Problem, gains: Gains, promised: dict[str, Any]) -> Design:
+    plant = problem.nominal
+    return Design(
+        ids,
+        problem,
+        gains,
+        J=_worst(problem, gains).J,
+        mse=evaluate(problem, gains).mse,
+        information_limit=information_limit(problem),
+        neighbourhood_mse=neighbourhood_mse(plant, problem.G),
+        centralized_mse=centralized_mse(plant),
+        **promised,
+    )
+
+
+def _worst(problem: Problem, gains: Gains) -> Cost:
+    """The true cost at the vertex where it is largest; DesignError where the estimators are not stable."""
+    return max((evaluate(problem, gains, plant) for plant in problem.vertices), key=lambda cost: cost.J)
+
+
+def _check_promise(J: float, bound: float) -> None:
+    if not np.isfinite(J) or bound * (1 + TOLERANCE) < J:
+        raise DesignError(f"numerical trouble: the design promised a cost of at most {bound:.6g}, and it costs {J:.6g}")
+
+
+def _stored(problem: Problem) -> dict[str, Any]:
+    """The problem as arrays: the plants' covariances Q = B W B' and R = D V D' say all that matters of the noises."""
+    arrays: dict[str, Any] = {"vertices": len(problem.vertices), "ny": problem.nominal.ny, "weights": problem.weights}
+    arrays |= {f"graph_{name}": getattr(problem, name) for name in ("F", "G", "H")}
+    for v, plant in enumerate(problem.vertices):
+        arrays |= {
+            f"plant{v}_A": plant.A,
+            f"plant{v}_C": plant.stacked_C,
+            f"plant{v}_Q": plant.Q,
+            f"plant{v}_R": plant.R,
+        }
+    return arrays
+
+
+def _restored(arrays: dict[str, Any]) -> Problem:
+    ends = np.cumsum(arrays["ny"]).tolist()
+    rows = [slice(end - size, end) for end, size in zip(ends, arrays["ny"].tolist(), strict=True)]
+    plants = []
+    for v in range(int(arrays["vertices"])):
+        A, C, Q, R = (arrays[f"plant{v}_{name}"] for name in "ACQR")
+        D = tuple(np.eye(at.stop - at.start) for at in rows)
+        plants.append(Plant(A, np.eye(len(A)), tuple(C[at] for at in rows), D, Q, tuple(R[at, at] for at in rows)))
+    F, G, H = (arrays[f"graph_{name}"] for name in "FGH")
+    return Problem(tuple(plants), F, G, H, arrays["weights"])

@@ -1,0 +1,125 @@
+"""Beyond the convex designs: descent on the true cost from any stable start, over the free entries of F and G.
+
+For one plant H is eliminated (`best_output`), and by the envelope theorem the gradients at that H are those of what
+is left. For a polytope H is free too, and the soft maximum of the vertices' costs is minimised: no certificate for
+the plants between the vertices, but closer to the worst case than any.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zfusion.methods.convex import minimiser
+from zfusion.methods.gramians import lyapunov, spectral_radius
+from zfusion.methods.stationary.cost import Gains, best_output, extended, gradients
+from zfusion.methods.stationary.problem import Plant, Problem
+from zfusion.model.types import Array
+
+NO_COST = 1e6
+"""What an unstable or nearly unstable network costs: the line search comes back from it."""
+
+STABLE = 0.99999
+"""Spectral radius from which on it is nearly unstable."""
+
+SHARPNESS = 800.0
+"""Of the soft maximum, times the ratio of a cost to that of the start: costs 0.1 % apart count as 1 to 2.2."""
+
+OPTIONS = {"maxiter": 2000, "maxfun": 4000, "ftol": 1e-10, "gtol": 1e-9, "maxcor": 30}
+
+
+class Refined(NamedTuple):
+    """What the descent found."""
+
+    gains: Gains
+    iterations: int
+    message: str
+    """Why it ended, in the words of the minimiser."""
+
+
+def refine(problem: Problem, start: Gains) -> Refined:
+    """Descend from `start`, which must be stable; InputError where scipy is not installed."""
+    robust = len(problem.vertices) > 1
+    search = _Polytope(problem, start) if robust else _Nominal(problem, start)
+    found = minimiser()(search.cost, search.pack(start), jac=True, method="L-BFGS-B", options=OPTIONS)
+    return Refined(search.unpack(found.x), int(found.nit), str(found.message))
+
+
+class _Nominal:
+    """The true cost of one plant as a function of the free entries of F and G."""
+
+    def __init__(self, problem: Problem, start: Gains) -> None:
+        self._problem = problem
+        self._free = problem.blocks
+        self._size = int(self._free.F.sum())
+        self._shapes = start.F.shape, start.G.shape, start.H.shape
+
+    def pack(self, gains: Gains) -> Array:
+        """The free entries in a row."""
+        return np.concatenate((gains.F[self._free.F], gains.G[self._free.G]))
+
+    def unpack(self, entries: Array) -> Gains:
+        """The gains with these free entries and the best H."""
+        F, G = self._dynamics(entries)
+        return Gains(F, G, best_output(self._problem, _covariance(self._problem.nominal, F, G)))
+
+    def cost(self, entries: Array) -> tuple[float, Array]:
+        """J and its derivatives."""
+        F, G = self._dynamics(entries)
+        plant = self._problem.nominal
+        if not _is_stable(F):
+            return NO_COST, np.zeros_like(entries)
+        P = _covariance(plant, F, G)
+        J, slope = gradients(self._problem, plant, Gains(F, G, best_output(self._problem, P)), P)
+        return J, self.pack(slope)
+
+    def _dynamics(self, entries: Array) -> tuple[Array, Array]:
+        F, G = np.zeros(self._shapes[0]), np.zeros(self._shapes[1])
+        F[self._free.F] = entries[: self._size]
+        G[self._free.G] = entries[self._size : self._size + int(self._free.G.sum())]
+        return F, G
+
+
+class _Polytope(_Nominal):
+    """The soft maximum of the vertices' costs as a function of the free entries of F, G and H."""
+
+    def __init__(self, problem: Problem, start: Gains) -> None:
+        super().__init__(problem, start)
+        costs = [self._vertex(plant, start)[0] for plant in problem.vertices]
+        self._sharpness = SHARPNESS / max(costs)
+
+    def pack(self, gains: Gains) -> Array:
+        """The free entries in a row."""
+        return np.concatenate((super().pack(gains), gains.H[self._free.H]))
+
+    def unpack(self, entries: Array) -> Gains:
+        """The gains with these free entries."""
+        H = np.zeros(self._shapes[2])
+        H[self._free.H] = entries[len(entries) - int(self._free.H.sum()) :]
+        return Gains(*self._dynamics(entries), H)
+
+    def cost(self, entries: Array) -> tuple[float, Array]:
+        """log Σ_v exp(sharpness J_v) / sharpness, and its derivatives."""
+        gains = self.unpack(entries)
+        if not _is_stable(gains.F):
+            return NO_COST, np.zeros_like(entries)
+        found = [self._vertex(plant, gains) for plant in self._problem.vertices]
+        costs = np.array([J for J, _ in found])
+        shares = np.exp(self._sharpness * (costs - costs.max()))
+        soft = costs.max() + np.log(shares.sum()) / self._sharpness
+        slope: Array = (shares / shares.sum()) @ np.array([self.pack(slope) for _, slope in found])
+        return float(soft), slope
+
+    def _vertex(self, plant: Plant, gains: Gains) -> tuple[float, Gains]:
+        return gradients(self._problem, plant, gains, _covariance(plant, gains.F, gains.G))
+
+
+def _covariance(plant: Plant, F: Array, G: Array) -> Array:
+    A_e, B_e = extended(plant, F, G)
+    return lyapunov(A_e, B_e @ B_e.T)
+
+
+def _is_stable(F: Array) -> bool:
+    """Whether the stationary covariance can be computed with; the plants themselves are stable, `Problem` saw to it."""
+    return bool(np.isfinite(F).all()) and spectral_radius(F) < STABLE
