@@ -17,8 +17,9 @@ from zfusion.drivers.replayed import verify
 from zfusion.drivers.simulated import simulate
 from zfusion.methods import METHODS
 from zfusion.methods.convex import DesignError
-from zfusion.methods.l2_linf import Design, Form, L2Linf, Problem, make_design, problem_of
+from zfusion.methods.l2_linf import Design, L2Linf, L2LinfOptions, Problem, make_design, problem_of
 from zfusion.methods.protocol import Outcome, Setting
+from zfusion.model.checks import ModelError
 from zfusion.model.distributions import Bernoulli, Normal
 from zfusion.model.matrices import Schedule, Terms
 from zfusion.model.network import Network
@@ -61,7 +62,7 @@ def mode_of(step: int) -> int:
 
 def nodes(design: Design, known: System, born: Mapping[int, int] | None = None) -> dict[int, L2Linf]:
     lives = born or {}
-    return {i: L2Linf(Setting(i, known, UNION, lives.get(i, 1)), design, mode_of) for i in IDS}
+    return {i: L2Linf(Setting(i, known, UNION, lives.get(i, 1)), design=design, modes=mode_of) for i in IDS}
 
 
 def test_a_system_becomes_the_problem_of_the_specification(sure: Design, missing: Design) -> None:
@@ -120,7 +121,7 @@ def test_covariance_is_exact_with_misses() -> None:
             if column < columns:
                 noise[column] = roots[column]
             x = noise[:2] + (np.array(MEAN) if column == columns else 0.0)
-            fresh = {i: L2Linf(Setting(i, known, network), design) for i in (1, 2)}
+            fresh = {i: L2Linf(Setting(i, known, network), design=design) for i in (1, 2)}
             mean, readings = np.array(MEAN), []
             for k in range(steps):
                 w = noise[2 + 4 * k : 6 + 4 * k]
@@ -190,8 +191,7 @@ def test_a_neighbour_of_another_mode_is_not_listened_to(sure: Design) -> None:
 def test_an_observer_takes_an_absent_neighbour_as_agreeing() -> None:
     """With no neighbour and no reading it is just the prediction A x̂."""
     known = example(None)
-    design = make_design(IDS, problem_of(known, [UNION], M=[[1.0, 0]]), Form.OBSERVER)
-    node = L2Linf(Setting(1, known, UNION), design)
+    node = L2Linf(Setting(1, known, UNION), L2LinfOptions("observer", output=[[1.0, 0.0]]))
     node.advance(0, 1, {1: node.begin(1, np.array([7.0]))}, None)  # type: ignore[arg-type]
     before = np.asarray(node.begin(2, None)["x"])
     node.skip(2)
@@ -276,6 +276,19 @@ def test_unstable_and_random_dynamics_are_refused() -> None:
         problem_of(random, network)
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"form": "any"}, "form: expected one of"),
+        ({"slack": 1}, "slack: expected true or false"),
+        ({"output": [1.0]}, "output: expected an array"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        L2LinfOptions(**given)
+
+
 STABLE: dict[str, Any] = {
     "system": {
         "F": [[0.9, 0.1], [0.0, 0.95]],
@@ -287,14 +300,14 @@ STABLE: dict[str, Any] = {
 
 
 def test_a_simulated_swarm_is_replayed_bit_for_bit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    scenario = walk(40, method={"name": "l2_linf"}, timing={"free_run": True}, **STABLE)
+    scenario = walk(40, method={"name": "l2_linf"}, **STABLE)
     known = scenario.system()
     design = make_design(known.ids, problem_of(known, [scenario.network, Network.isolated(known.ids)], CHAIN))
     assert isinstance(design.problem, Problem)
 
     class Prepared(L2Linf):
         def __init__(self, setting: Setting) -> None:
-            super().__init__(setting, design, mode_of)
+            super().__init__(setting, design=design, modes=mode_of)
 
     monkeypatch.setitem(METHODS, "l2_linf", Prepared)
     path = tmp_path / "run.mcap"

@@ -13,6 +13,7 @@ from zfusion.methods import convex
 from zfusion.methods.convex import DesignError
 from zfusion.methods.stationary import Choice, Gramian, Plant, Problem, make_design
 from zfusion.methods.stationary.cost import Gains, best_output, evaluate, extended, gradients, masked, rescaled
+from zfusion.methods.stationary.doubt import Doubted
 from zfusion.methods.stationary.limits import (
     centralized_mse,
     information_limit,
@@ -171,6 +172,56 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert (cost(ahead) - cost(behind)) / (2 * step) == pytest.approx(along, rel=1e-6)
 
 
+def test_gradients_under_doubt_are_those_of_finite_differences() -> None:
+    problem, (F, G, _) = random_problem(4), local_predictors(random_problem(4))
+    doubted, rng = Doubted(problem, 0.05), np.random.default_rng(3)
+    F = F + 0.1 * problem.blocks.F * rng.standard_normal(F.shape)
+    found = doubted.cost(F, G)
+    assert found is not None
+    dF, dG = (free * rng.standard_normal(free.shape) for free in (problem.blocks.F, problem.blocks.G))
+    along = float(np.sum(found[1].F * dF) + np.sum(found[1].G * dG))
+    step = 1e-5
+    ahead, behind = (doubted.cost(F + sign * step * dF, G + sign * step * dG) for sign in (1, -1))
+    assert ahead is not None
+    assert behind is not None
+    assert (ahead[0] - behind[0]) / (2 * step) == pytest.approx(along, rel=1e-5)
+
+
+def test_no_doubt_is_the_true_cost_and_too_much_has_none() -> None:
+    problem, (F, G, _) = designed("RING").problem, designed("RING").gains
+    found = Doubted(problem, 0.0).cost(F, G)
+    assert found is not None
+    P = evaluate(problem, designed("RING").gains).P
+    assert found[0] == pytest.approx(evaluate(problem, Gains(F, G, best_output(problem, P))).J, rel=1e-9)
+    assert Doubted(problem, 100.0).cost(F, G) is None
+    with pytest.raises(DesignError, match="not stable"):
+        refine(problem, designed("RING").gains, 100.0)
+    with pytest.raises(InputError, match="for one plant"):
+        refine(Problem.of([small_plant(), small_plant(0.5)], np.ones((2, 2))), designed("RING").gains, 0.1)
+
+
+def test_doubt_is_a_simulated_factor() -> None:
+    """Messages multiplied by 1 + ζ: the mean of the cost over independent runs, within 6 standard errors."""
+    problem, (F, G, _) = designed("RING").problem, designed("RING").gains
+    doubt, runs, rng = 0.1, 3000, np.random.default_rng(8)
+    found = Doubted(problem, doubt).cost(F, G)
+    P = Doubted(problem, doubt).covariance(F, G)
+    assert found is not None
+    assert P is not None
+    H, one = Doubted(problem, doubt).best_output(P), problem.nominal
+    x, xi = np.zeros((3, runs)), np.zeros((4, 3, runs))
+    blocks = F.reshape(4, 3, 4, 3), G.reshape(4, 3, 4), H.reshape(4, 3, 4, 3)
+    for _ in range(150):
+        y = np.vstack(one.C) @ x + one.sensor_root @ rng.standard_normal((4, runs))
+        factor = 1 + np.sqrt(doubt) * (1 - np.eye(4))[:, :, None] * rng.standard_normal((4, 4, runs))
+        estimates = np.einsum("iajb,ijr,jbr->iar", blocks[2], factor, xi)
+        errors = ((x - estimates) ** 2).sum(axis=(0, 1))
+        moved = np.einsum("iajb,ijr,jbr->iar", blocks[0], factor, xi)
+        xi = moved + np.einsum("iaj,ijr,jr->iar", blocks[1], factor, y)
+        x = one.A @ x + one.process_root @ rng.standard_normal((3, runs))
+    assert abs(errors.mean() - found[0]) < 6 * errors.std(ddof=1) / np.sqrt(runs)
+
+
 def test_best_output_is_best() -> None:
     design = designed("RING", CONTROLLABILITY)
     problem, (F, G, _) = design.problem, design.gains
@@ -197,9 +248,11 @@ def test_coordinates_change_nothing_that_can_be_seen() -> None:
 
 
 @pytest.mark.parametrize("graph", ["PATH", "RING"])
-def test_descent_without_convex_design_comes_near_the_limit(graph: str) -> None:
+def test_descent_without_convex_design_comes_near_the_limit_and_bears_losses(graph: str) -> None:
     problem = Problem.of(plant(), GRAPHS[graph])
     design = make_design(IDS, problem, convex=False)
+    for loss in (0.05, 0.1, 0.3):
+        assert under_loss(design, loss).mse.sum() < 1.05 * under_loss(designed(graph), loss).mse.sum()
     assert design.bound is None
     assert design.iterations > 0
     limit = float(design.information_limit.sum())
@@ -213,7 +266,7 @@ def test_larger_networks_take_the_route_without_convex_design(monkeypatch: pytes
     C = tuple(np.array([[1.0, 0.0]] if i % 2 else [[0.0, 1.0]]) for i in range(n))
     one = Plant(A, np.eye(nx), C, (np.eye(1),) * n, 0.1 * np.eye(nx), (np.eye(1),) * n)
     ring = np.eye(n) + np.roll(np.eye(n), 1, axis=1)
-    monkeypatch.setattr("zfusion.methods.stationary.refine.OPTIONS", {"maxiter": 15})
+    monkeypatch.setattr("zfusion.methods.stationary.refine.DOUBT_OPTIONS", {"maxiter": 5})
     design = make_design(tuple(range(n)), Problem.of(one, ring))
     assert design.solver == ""
     assert design.information_limit.sum() <= design.J < design.neighbourhood_mse.sum()
@@ -223,15 +276,15 @@ LOSSES = (0.0, 0.1, 0.3, 0.5, 0.9)
 
 
 @pytest.mark.parametrize("graph", ["PATH", "RING"])
-def test_convex_designs_bear_losses_and_refined_ones_do_not(graph: str) -> None:
-    """The descent gains less than 1 % where nothing is lost, and pays for it where something is."""
+def test_convex_designs_bear_losses_better_than_refined_ones(graph: str) -> None:
+    """The descent gains less than 1 % where nothing is lost, and pays for it where something is, by 2 to 200 %."""
     convex_design, refined = designed(graph), designed(graph, refine=True)
     costs = [under_loss(convex_design, loss).mse.sum() for loss in LOSSES]
     assert costs[0] == pytest.approx(convex_design.J, rel=1e-9)
     assert costs == sorted(costs)
     assert costs[-1] < own_sensor_mse(plant()).sum()
     assert under_loss(refined, 0.0).mse.sum() < costs[0]
-    assert under_loss(refined, 0.1).mse.sum() > 1.2 * costs[1]
+    assert under_loss(refined, 0.1).mse.sum() > 1.02 * costs[1]
 
 
 def worst(problem: Problem, gains: Gains) -> float:

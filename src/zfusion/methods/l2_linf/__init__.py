@@ -8,6 +8,7 @@ from zfusion.methods.l2_linf.design import Design, make_design
 from zfusion.methods.l2_linf.filter import L2Linf
 from zfusion.methods.l2_linf.lmi import Form
 from zfusion.methods.l2_linf.mapping import problem_of
+from zfusion.methods.l2_linf.options import L2LinfOptions
 from zfusion.methods.l2_linf.problem import Problem
 
-__all__ = ["Design", "Form", "L2Linf", "Problem", "make_design", "problem_of"]
+__all__ = ["Design", "Form", "L2Linf", "L2LinfOptions", "Problem", "make_design", "problem_of"]

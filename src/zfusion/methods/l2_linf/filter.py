@@ -18,26 +18,27 @@ from typing import ClassVar, cast
 
 import numpy as np
 
-from zfusion.methods.l2_linf.design import METHOD, Design, make_design
-from zfusion.methods.l2_linf.mapping import problem_of
+from zfusion.methods.l2_linf.design import METHOD, Design
+from zfusion.methods.l2_linf.options import L2LinfOptions
 from zfusion.methods.l2_linf.problem import Problem, closed
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.model.network import Network
 from zfusion.model.types import Array, NodeId
-from zfusion.stages import Field, Kind, Stage
+from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
 
 PREDICTION = Stage(
-    "prediction",
-    (
-        Field("y", Kind.OPTIONAL_VECTOR, ("ny",), "the sensor's reading of this step; nil if it had none"),
-        Field("x", Kind.VECTOR, ("nx",), "what the sender expected of the state of this step"),
-    ),
-    "what an l2-l∞ filter tells its neighbours",
+    MEASUREMENT.name,
+    (*MEASUREMENT.fields, Field("x", Kind.VECTOR, ("nx",), "what the sender expected of the state of this step")),
+    "what a sensor measured, and what its node had expected of the state",
 )
+"""The stage of the measurements, for whoever records or scores them, with x̂ beside them."""
 
 Modes = Callable[[int], int]
 """The mode of a step: the same at all nodes."""
+
+
+DEFAULT = L2LinfOptions()
 
 
 class L2Linf:
@@ -56,14 +57,20 @@ class L2Linf:
         """The scenario's graph: of all that some mode joins."""
         return graph
 
-    def __init__(self, setting: Setting, design: Design | None = None, modes: Modes = lambda step: 0) -> None:  # noqa: ARG005
+    def __init__(
+        self,
+        setting: Setting,
+        options: L2LinfOptions = DEFAULT,
+        design: Design | None = None,
+        modes: Modes = lambda step: 0,  # noqa: ARG005
+    ) -> None:
         """`design` must be the same at all nodes; without it, the node makes one for the one graph of the setting.
 
         DesignError where there is none for this system.
         """
         system = setting.system
         if design is None:
-            design = make_design(system.ids, problem_of(system, [setting.network]))
+            design = options.design(system, [setting.network])
         self._problem, self._modes = design.problem, modes
         self._position = {j: n for n, j in enumerate(design.ids)}
         self._neighbourhood = setting.network.neighbours(setting.node)

@@ -48,6 +48,8 @@ def certify(problem: Problem, gains: Gains) -> Certificate:
     cp = cvxpy()
     problem, unit = normalised(problem)
     motions = closed(problem, gains)
+    if not (size := radius(problem, gains)) < 1:
+        raise DesignError(f"{FAILURE}: they are not stable in mean square (radius {size:.6g})")
     extended = problem.nx + problem.size
     Ps = [cp.Variable((extended, extended), symmetric=True) for _ in problem.masks]
     delta = cp.Variable()

@@ -23,6 +23,9 @@ METHOD = "stationary"
 LARGEST_CONVEX = 40
 """n nx up to which the convex design takes minutes at most; beyond it descends from the local predictors."""
 
+DOUBT = 0.01
+"""Of a descent from the local predictors: within a thousandth of what it reaches without, and it bears losses."""
+
 TOLERANCE = 1e-5
 """By how much of itself a cost may exceed its bound: what the solver's own accuracy makes of a tight one."""
 
@@ -120,12 +123,14 @@ def make_design(
     *,
     convex: bool | None = None,
     refine: bool | None = None,
+    doubt: float | None = None,
 ) -> Design:
     """Design the network: by linear matrix inequalities, by descent on the true cost, or by one after the other.
 
     `convex` is by default whether n nx <= LARGEST_CONVEX; without it the descent begins at the local predictors.
-    `refine` is by default what `convex` is not. A descent reaches the information limit or nearly so, but it uses up
-    what makes the convex designs bear losses (`losses.under_loss`), and on a polytope it has no certificate.
+    `refine` is by default what `convex` is not. A descent reaches the information limit or nearly so; on a polytope it
+    has no certificate. `doubt` is how far it takes messages for unreliable (module `doubt`), by default DOUBT without a
+    convex design and nothing after one, where the cost is then the lowest, but not under losses (`losses.under_loss`).
 
     DesignError where it is infeasible or breaks its promise; InputError without the packages it needs.
     """
@@ -151,7 +156,8 @@ def make_design(
         gains = local_predictors(problem)
         worst = _worst(problem, gains)
     if refine:
-        refined = refine_gains(problem, gains)
+        doubt = (0.0 if convex or len(problem.vertices) > 1 else DOUBT) if doubt is None else doubt
+        refined = refine_gains(problem, gains, doubt)
         candidate = _worst(problem, refined.gains)
         if candidate.J < worst.J:
             gains = rescaled(problem, refined.gains, evaluate(problem, refined.gains).P)

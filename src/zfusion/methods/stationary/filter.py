@@ -18,25 +18,29 @@ import numpy as np
 
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.stationary.cost import evaluate, extended
-from zfusion.methods.stationary.design import METHOD, Design, make_design
-from zfusion.methods.stationary.mapping import problem_of
+from zfusion.methods.stationary.design import METHOD, Design
+from zfusion.methods.stationary.options import StationaryOptions
 from zfusion.methods.stationary.substitution import NodeGains, Substitution, There
 from zfusion.model.network import Network
 from zfusion.model.types import Array, NodeId
-from zfusion.stages import Field, Kind, Stage
+from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
 
 ESTIMATOR = Stage(
-    "estimator",
+    MEASUREMENT.name,
     (
-        Field("y", Kind.OPTIONAL_VECTOR, ("ny",), "the sensor's reading of this step; nil if it had none"),
-        Field("xi", Kind.VECTOR, ("nx",), "the state of the sender's estimator, in the design's coordinates"),
+        *MEASUREMENT.fields,
+        Field("xi", Kind.VECTOR, ("nx",), "the state of the estimator, in the design's coordinates"),
     ),
-    "what a stationary estimator tells its neighbours",
+    "what a sensor measured, and the state of its node's estimator",
 )
+"""The stage of the measurements, for whoever records or scores them, with ξ beside them."""
 
 SETTLED = 1e-13
 """Change of the covariance in one step, relative to its largest entry, that counts as none."""
+
+
+DEFAULT = StationaryOptions()
 
 
 class Stationary:
@@ -55,20 +59,20 @@ class Stationary:
         """The scenario's graph."""
         return graph
 
-    def __init__(self, setting: Setting, design: Design | None = None, *, filtered: bool = False) -> None:
+    def __init__(self, setting: Setting, options: StationaryOptions = DEFAULT, design: Design | None = None) -> None:
         """`design` must be the same at all nodes, to the last bit; without it, the node makes one.
 
         DesignError where there is none for this system.
         """
         system = setting.system
         if design is None:
-            design = make_design(system.ids, problem_of(system, setting.network))
+            design = options.design(system, setting.network)
         self._design, self._plant = design, design.problem.nominal
         self._position = {j: n for n, j in enumerate(design.ids)}
         self._neighbourhood = setting.network.neighbours(setting.node)
         i = self._position[setting.node]
         stationary = evaluate(design.problem, design.gains).P
-        self._gains = Substitution(design.problem, design.gains, stationary, i, filtered)
+        self._gains = Substitution(design.problem, design.gains, stationary, i, options.filtered)
         self._state = np.zeros(self._plant.nx)
         self._mean = np.linalg.matrix_power(self._plant.A, setting.born) @ system.initial_mean
         first = self._plant.A @ system.initial_covariance @ self._plant.A.T + self._plant.Q

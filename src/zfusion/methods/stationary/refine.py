@@ -11,9 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zfusion.methods.convex import minimiser
+from zfusion.errors import InputError
+from zfusion.methods.convex import DesignError, minimiser
 from zfusion.methods.gramians import lyapunov, spectral_radius
 from zfusion.methods.stationary.cost import Gains, best_output, extended, gradients
+from zfusion.methods.stationary.doubt import Doubted
 from zfusion.methods.stationary.problem import Plant, Problem
 from zfusion.model.types import Array
 
@@ -28,6 +30,9 @@ SHARPNESS = 800.0
 
 OPTIONS = {"maxiter": 2000, "maxfun": 4000, "ftol": 1e-10, "gtol": 1e-9, "maxcor": 30}
 
+DOUBT_OPTIONS = OPTIONS | {"maxiter": 300, "maxfun": 600, "ftol": 1e-7}
+"""With doubt, where the last digits do not matter."""
+
 
 class Refined(NamedTuple):
     """What the descent found."""
@@ -38,11 +43,22 @@ class Refined(NamedTuple):
     """Why it ended, in the words of the minimiser."""
 
 
-def refine(problem: Problem, start: Gains) -> Refined:
-    """Descend from `start`, which must be stable; InputError where scipy is not installed."""
-    robust = len(problem.vertices) > 1
-    search = _Polytope(problem, start) if robust else _Nominal(problem, start)
-    found = minimiser()(search.cost, search.pack(start), jac=True, method="L-BFGS-B", options=OPTIONS)
+def refine(problem: Problem, start: Gains, doubt: float = 0.0) -> Refined:
+    """Descend from `start`, which must be stable; see the module `doubt` for what that is.
+
+    InputError where scipy is not installed, and for a doubt on a polytope; DesignError where the start is not stable
+    under the doubt.
+    """
+    if doubt and len(problem.vertices) > 1:
+        raise InputError("stationary: a descent with doubt is for one plant, not for a polytope")
+    search: _Nominal
+    if doubt:
+        search = _WithDoubt(problem, start, doubt)
+    else:
+        search = _Polytope(problem, start) if len(problem.vertices) > 1 else _Nominal(problem, start)
+    found = minimiser()(
+        search.cost, search.pack(start), jac=True, method="L-BFGS-B", options=DOUBT_OPTIONS if doubt else OPTIONS
+    )
     return Refined(search.unpack(found.x), int(found.nit), str(found.message))
 
 
@@ -79,6 +95,30 @@ class _Nominal:
         F[self._free.F] = entries[: self._size]
         G[self._free.G] = entries[self._size : self._size + int(self._free.G.sum())]
         return F, G
+
+
+class _WithDoubt(_Nominal):
+    """The same under doubt."""
+
+    def __init__(self, problem: Problem, start: Gains, doubt: float) -> None:
+        super().__init__(problem, start)
+        self._doubted = Doubted(problem, doubt)
+
+    def unpack(self, entries: Array) -> Gains:
+        """The gains with these free entries and the best H under doubt."""
+        F, G = self._dynamics(entries)
+        P = self._doubted.covariance(F, G)
+        if P is None:
+            raise DesignError("the descent has no start: with so much doubt the estimators are not stable")
+        return Gains(F, G, self._doubted.best_output(P))
+
+    def cost(self, entries: Array) -> tuple[float, Array]:
+        """J and its derivatives."""
+        F, G = self._dynamics(entries)
+        found = self._doubted.cost(F, G) if _is_stable(F) else None
+        if found is None:
+            return NO_COST, np.zeros_like(entries)
+        return found[0], self.pack(found[1])
 
 
 class _Polytope(_Nominal):
