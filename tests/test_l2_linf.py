@@ -231,7 +231,7 @@ def expected_peak(problem: Problem, gains: Gains, w: Array) -> float:
 @pytest.mark.parametrize("seed", range(2))
 def test_random_networks(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    n, nx, modes = 3, 2, 3
+    n, nx, modes = 3, 2, 2
     A = rng.standard_normal((nx, nx))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
     graphs = np.array([np.minimum(np.eye(n) + (rng.random((n, n)) < 0.4), 1) for _ in range(modes)])

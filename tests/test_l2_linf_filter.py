@@ -213,6 +213,27 @@ def test_a_restarted_node_begins_with_the_prior_and_says_so(sure: Design) -> Non
     assert outcome.P.trace() > told[-1][3].P.trace()
 
 
+def test_a_late_birth_does_not_go_through_all_of_the_past(missing: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    known, born = example(MISSING), 900
+    covariances = []
+    for remembered in (10**9, 300):  # errors shrink by 0.8 a step: 0.8^300 is nothing
+        monkeypatch.setattr("zfusion.methods.l2_linf.filter.REMEMBERED", remembered)
+        asked: list[int] = []
+
+        def noted(step: int, asked: list[int] = asked) -> int:
+            asked.append(step)
+            return mode_of(step)
+
+        node = L2Linf(Setting(1, known, UNION, born), design=missing, modes=noted)
+        assert min(asked) == max(1, born - remembered)
+        for step in range(born, born + 4):
+            said = {1: node.begin(step, None)}
+            outcome = node.advance(0, step, said, None)  # type: ignore[arg-type]
+        assert isinstance(outcome, Outcome)
+        covariances.append(outcome.P)
+    np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-11)
+
+
 def test_designs_are_kept_in_files(tmp_path: Path, missing: Design) -> None:
     missing.save(tmp_path / "d.npz")
     again = Design.load(tmp_path / "d.npz", missing.fingerprint)

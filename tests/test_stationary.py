@@ -252,7 +252,7 @@ def test_descent_without_convex_design_comes_near_the_limit_and_bears_losses(gra
     problem = Problem.of(plant(), GRAPHS[graph])
     design = make_design(IDS, problem, convex=False)
     for loss in (0.05, 0.1, 0.3):
-        assert under_loss(design, loss).mse.sum() < 1.05 * under_loss(designed(graph), loss).mse.sum()
+        assert under_loss(design, loss).mse.sum() < 1.08 * under_loss(designed(graph), loss).mse.sum()
     assert design.bound is None
     assert design.iterations > 0
     limit = float(design.information_limit.sum())
@@ -308,16 +308,20 @@ def check_robust(graph: str, choice: Choice, bound: float, cost: float) -> Gains
 
 
 @pytest.mark.slow
-def test_robust_designs_of_the_reference() -> None:
+def test_robust_design_of_the_path_and_its_descent() -> None:
     numbers = ROBUST["PATH"]
     gains = check_robust("PATH", Choice(), *numbers[:2])
-    check_robust("PATH", CONTROLLABILITY, *numbers[2:4])
-    check_robust("PATH", Choice(plain=True), *numbers[4:6])
     problem = Problem.of(polytope(), GRAPHS["PATH"])
     refined = refine(problem, gains)
     limit = max(information_limit(problem, one).sum() for one in polytope(9))
     assert limit == pytest.approx(numbers[9], abs=DIGITS)
     assert limit < worst(problem, refined.gains) <= numbers[6] + DIGITS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("choice", "at"), [(CONTROLLABILITY, 2), (Choice(plain=True), 4)])
+def test_other_robust_designs_of_the_reference(choice: Choice, at: int) -> None:
+    check_robust("PATH", choice, *ROBUST["PATH"][at : at + 2])
 
 
 @pytest.mark.slow

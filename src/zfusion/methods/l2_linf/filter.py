@@ -18,6 +18,7 @@ from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.gramians import lyapunov
 from zfusion.methods.l2_linf.design import METHOD, Design
 from zfusion.methods.l2_linf.options import L2LinfOptions
 from zfusion.methods.l2_linf.problem import Problem, closed
@@ -39,6 +40,10 @@ Modes = Callable[[int], int]
 
 
 DEFAULT = L2LinfOptions()
+
+REMEMBERED = 2048
+"""Steps before a node's birth of which it goes through the modes, to know P: a tenth of a second; older ones are
+forgotten. (Filters are as quick as the state; where ρ(A) = 0.99, the factor is 0.99^4096.)"""
 
 
 class L2Linf:
@@ -88,8 +93,9 @@ class L2Linf:
         ]
         self._x = np.zeros(nx)
         self._mean = np.linalg.matrix_power(self._problem.A, setting.born) @ system.initial_mean
-        self._covariance = _Moments(design, system.initial_mean, system.initial_covariance)
-        for step in range(1, setting.born):
+        first = max(1, setting.born - REMEMBERED)
+        self._covariance = _Moments(design, first, system.initial_mean, system.initial_covariance)
+        for step in range(first, setting.born):
             self._covariance.advance(modes(step))
         if setting.born > 1:
             self._covariance.restart(i)
@@ -128,7 +134,8 @@ class L2Linf:
 class _Moments:
     """Cov[η_k] given the modes up to k-1, from the prior on, w being white with unit covariance."""
 
-    def __init__(self, design: Design, mean: Array, covariance: Array) -> None:
+    def __init__(self, design: Design, first: int, mean: Array, covariance: Array) -> None:
+        """At step `first`, when every x̂ is the prior mean; `mean` and `covariance` are those of x_0."""
         problem = design.problem
         self._problem: Problem = problem
         self._lost = [
@@ -137,10 +144,11 @@ class _Moments:
         """By mode σ_i H(:, i) C_i of every sensor that may miss."""
         self._motions = closed(problem, design.gains)
         self._noises = [motion.B @ motion.B.T for motion in self._motions]
-        self._mean = problem.A @ mean
-        first = problem.A @ covariance @ problem.A.T + problem.B @ problem.B.T
+        power = np.linalg.matrix_power(problem.A, first)
+        settled = lyapunov(problem.A, problem.B @ problem.B.T)
         both = np.vstack((np.eye(problem.nx), problem.E))
-        self._P = both @ first @ both.T
+        self._mean = power @ mean
+        self._P: Array = both @ (settled + power @ (covariance - settled) @ power.T) @ both.T
 
     def of(self, i: int) -> Array:
         """Cov[e_i], (nx, nx)."""

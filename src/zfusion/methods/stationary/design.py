@@ -23,8 +23,8 @@ METHOD = "stationary"
 LARGEST_CONVEX = 40
 """n nx up to which the convex design takes minutes at most; beyond it descends from the local predictors."""
 
-DOUBT = 0.01
-"""Of a descent from the local predictors: within a thousandth of what it reaches without, and it bears losses."""
+DOUBT = 0.003
+"""Of a descent from the local predictors: it costs less than a per cent where nothing is lost, and bears losses."""
 
 TOLERANCE = 1e-5
 """By how much of itself a cost may exceed its bound: what the solver's own accuracy makes of a tight one."""

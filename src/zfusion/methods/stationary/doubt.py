@@ -2,7 +2,7 @@
 
 It is what message loss does, with doubt = p / (1 - p), to gains that make up for it by a factor. A descent on the
 cost without doubt buys its last tenths of a per cent with differences of neighbours' ξ so fine that one lost message
-undoes them; with a doubt of one per cent it costs next to nothing more and bears losses.
+undoes them; with a doubt of some thousandths it costs next to nothing more and bears losses.
 
 With W = [F G] without the own blocks, Z the covariance of (ξ; y) and D the parts of a matrix that belong to one node:
 
