@@ -1,0 +1,157 @@
+"""Consensus on measurements, on-line: every node runs a Kalman filter on its share of everybody's measurements.
+
+    x_i <- x_i + u_i - u_i^old,   M_i <- M_i + U_i - U_i^old            u_i = C_iᵀ Q_i^-1 y_i,   U_i = C_iᵀ Q_i^-1 C_i
+    n times:  x_i <- x_i + γ Σ_j a_ij (x_j - x_i),   M_i likewise
+    P_i^-1 <- P_i^-1 + N M_i,     P_i^-1 ŝ_i <- P_i^-1 ŝ_i + N x_i
+
+Σ_i x_i = Σ_i C_iᵀ Q_i^-1 y_i holds at all times, and with it the estimates' being right in the end. A message that is
+lost one way only breaks it for good: what one node took, the other did not give. Losses on both directions of an edge
+at once only slow it down. P_i is what the node believes; `prediction` has the covariance of its errors.
+
+Source: Spanos, Olfati-Saber, Murray, "Approximate distributed Kalman filtering in sensor networks with quantifiable
+performance", IPSN 2005; the input-difference form and the information form are derived in docs/methods/consensus.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, cast
+
+import numpy as np
+
+from zfusion.methods.consensus.mixing import Mixing, Spectrum
+from zfusion.methods.packing import packed, unpacked
+from zfusion.methods.protocol import Fields, Outcome, Setting
+from zfusion.methods.white import White
+from zfusion.model.checks import ModelError
+from zfusion.model.network import Network
+from zfusion.model.types import Array, NodeId
+from zfusion.stages import MEASUREMENT, Field, Kind, Stage
+from zfusion.used_sets import Ledger, UsedSet
+
+MOST_ROUNDS = 64
+"""Exchanges a step; each is a round trip of the whole swarm."""
+
+DEFINITE = 1e-12
+"""Smallest eigenvalue, in parts of the largest entry, of an information matrix that a filter can be updated with."""
+
+SHARE = (
+    Field("x", Kind.VECTOR, ("nx",), "the node's share of everybody's measurements, as information"),
+    Field("M", Kind.VECTOR, ("nxx",), "its weight, the lower triangle row by row"),
+)
+
+
+@dataclass(frozen=True)
+class ConsensusOptions:
+    """What a scenario may say of the method."""
+
+    rounds: int = 4
+    """n, exchanges with the neighbours at every step."""
+    step_size: float | Literal["fastest", "careful"] = "careful"
+    """γ; "fastest": 2 / (λ_2 + λ_N), best for many rounds; "careful": 1 / λ_N, which no few rounds make worse."""
+    chebyshev: bool = False
+    """Chebyshev's weights: faster for many rounds."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.rounds, bool) or not isinstance(self.rounds, int) or not 1 <= self.rounds <= MOST_ROUNDS:
+            raise ModelError("rounds", self.rounds, f"expected a whole number from 1 to {MOST_ROUNDS}")
+        if not isinstance(self.chebyshev, bool):
+            raise ModelError("chebyshev", self.chebyshev, "expected true or false")
+        named = isinstance(self.step_size, str) and self.step_size in ("fastest", "careful")
+        if not named and not (isinstance(self.step_size, int | float) and self.step_size > 0):
+            raise ModelError("step_size", self.step_size, "expected a number > 0, 'fastest' or 'careful'")
+
+    def mixing(self, network: Network) -> Mixing:
+        """How values are mixed on a network; ModelError where consensus cannot be had on it."""
+        spectrum = Spectrum.of(_weights(network), network.ids)
+        named = {"fastest": spectrum.fastest_step, "careful": 1.0 / float(spectrum.values[-1])}
+        step = named[self.step_size] if isinstance(self.step_size, str) else float(self.step_size)
+        return Mixing(spectrum, self.rounds, step, self.chebyshev)
+
+
+def _weights(network: Network) -> Array:
+    place = {node: n for n, node in enumerate(network.ids)}
+    a = np.zeros((len(place), len(place)))
+    for i in network.ids:
+        for j in network.neighbours(i):
+            a[place[i], place[j]] = network.weights.get((i, j), 1.0)
+    return a
+
+
+class Consensus:
+    """One node of the consensus filter."""
+
+    name: ClassVar[str] = "consensus"
+
+    @staticmethod
+    def stages(options: ConsensusOptions) -> tuple[Stage, ...]:
+        """One for each exchange; with the first comes the measurement itself, for whoever records."""
+        first = Stage(MEASUREMENT.name, (*MEASUREMENT.fields, *SHARE), "what a sensor measured, and its node's share")
+        later = (*SHARE, Field("used", Kind.IDS, (), "whose shares of the exchange before were mixed in"))
+        return (first, *(Stage(f"mix{n}", later, f"exchange {n} of a step") for n in range(2, options.rounds + 1)))
+
+    @staticmethod
+    def network(graph: Network) -> Network:
+        """The scenario's graph."""
+        return graph
+
+    def __init__(self, setting: Setting, options: ConsensusOptions) -> None:
+        """ModelError for a network that is directed or falls apart."""
+        self._node = setting.node
+        self._neighbourhood = setting.network.neighbours(setting.node)
+        mixing = options.mixing(setting.network)
+        self._omegas, self._gamma = mixing.relaxations, mixing.gamma
+        self._a = {j: setting.network.weights.get((self._node, j), 1.0) for j in self._neighbourhood}
+        self._count = len(setting.network.ids)
+        self._model = White(setting.system, (self._node,))
+        self._s, self._P = self._model.before(setting.born)
+        nx = len(self._s)
+        self._size = nx + nx * (nx + 1) // 2
+        self._share, self._earlier, self._old = np.zeros(self._size), np.zeros(self._size), np.zeros(self._size)
+
+    def begin(self, step: int, y: Array | None) -> Fields:
+        """The change of the own input into the own share; without a reading the last one stands."""
+        self.skip(step)
+        if y is not None:
+            sensor = self._model.information(step)[self._node]
+            new = np.concatenate((sensor.gain @ y, packed(sensor.weight)))
+            self._share, self._old = self._share + new - self._old, new
+        return {"y": y, **self._told()}
+
+    def skip(self, step: int) -> None:
+        """Predict only."""
+        self._s, self._P = self._model.predict(step, self._s, self._P)
+
+    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
+        """Mix with what arrived; after the last exchange, update."""
+        own, moved = self._share, np.zeros(self._size)
+        used: UsedSet = tuple(j for j in self._neighbourhood if j in arrived)
+        for j in used:
+            if j != self._node:
+                theirs = np.concatenate((cast(Array, arrived[j]["x"]), cast(Array, arrived[j]["M"])))
+                moved += self._a[j] * (theirs - own)
+        mixed, omega = own + self._gamma * moved, self._omegas[stage]
+        self._share = mixed if stage == 0 else omega * mixed + (1.0 - omega) * self._earlier
+        self._earlier = own
+        if stage + 1 < len(self._omegas):
+            return {**self._told(), "used": used}
+        self._update()
+        return Outcome(self._s, self._P, used)
+
+    def _told(self) -> dict[str, object]:
+        nx = len(self._s)
+        return {"x": self._share[:nx], "M": self._share[nx:]}
+
+    def _update(self) -> None:
+        """The Kalman filter with N times the share, unless the share's weight is none, as it may be at first."""
+        nx = len(self._s)
+        M = unpacked(self._share[nx:], nx)
+        prior = np.linalg.inv(self._P)
+        information = prior + self._count * M
+        information = 0.5 * (information + information.T)
+        if np.linalg.eigvalsh(information)[0] <= DEFINITE * np.abs(information).max():
+            return
+        P = np.linalg.inv(information)
+        self._P = 0.5 * (P + P.T)
+        self._s = self._P @ (prior @ self._s + self._count * self._share[:nx])

@@ -1,0 +1,81 @@
+"""The Kalman consensus filter: a Kalman filter on the neighbourhood's measurements that also leans to its neighbours.
+
+    M_i  = (P_i^-1 + Σ_{j in N_i} H_jᵀ R_j^-1 H_j)^-1
+    x̂_i = x̄_i + M_i Σ_{j in N_i} H_jᵀ R_j^-1 (y_j - H_j x̄_i) + γ P_i Σ_{j in N_i} (x̄_j - x̄_i),   γ = ε / (1 + |P_i|)
+    x̄_i <- F x̂_i,   P_i <- F M_i Fᵀ + Q            |.| Frobenius' norm
+
+M_i is what the filter reports: the covariance of a filter without the last term, not of the error of this one.
+
+Source: Olfati-Saber, "Kalman-consensus filter: optimality, stability, and performance", Proc. 48th IEEE CDC (2009)
+7036-7042, Algorithm 1; the filter itself is from his "Distributed Kalman filtering for sensor networks", 46th CDC (2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, cast
+
+import numpy as np
+
+from zfusion.methods.protocol import Fields, Outcome, Setting
+from zfusion.methods.white import White
+from zfusion.model.network import Network
+from zfusion.model.types import Array, NodeId
+from zfusion.stages import MEASUREMENT, Field, Kind, Stage
+from zfusion.used_sets import Ledger
+
+EPSILON = 0.05
+"""ε where nothing else is said: small beside the step, as the source has it."""
+
+PREDICTION = Stage(
+    "prediction",
+    (
+        Field("y", Kind.OPTIONAL_VECTOR, ("ny",), "the sensor's reading of this step; nil if it had none"),
+        Field("x", Kind.VECTOR, ("nx",), "the state as it was predicted before this reading"),
+    ),
+    "what a sensor measured and what it had expected the state to be",
+)
+
+
+class KalmanConsensus:
+    """One node of the Kalman consensus filter: everything in one exchange."""
+
+    name: ClassVar[str] = "kalman_consensus"
+    stages: ClassVar[tuple[Stage, ...]] = (EXPECTATION,)
+
+    @staticmethod
+    def network(graph: Network) -> Network:
+        """The scenario's graph."""
+        return graph
+
+    def __init__(self, setting: Setting, epsilon: float = EPSILON) -> None:
+        self._neighbourhood = setting.network.neighbours(setting.node)
+        self._model = White(setting.system, self._neighbourhood)
+        self._x, self._P = self._model.before(setting.born)
+        self._epsilon = epsilon
+
+    def begin(self, step: int, y: Array | None) -> Fields:
+        """The measurement and the prediction."""
+        self.skip(step)
+        return {"y": y, "x": self._x}
+
+    def skip(self, step: int) -> None:
+        """Predict only."""
+        self._x, self._P = self._model.predict(step, self._x, self._P)
+
+    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
+        """Update with all measurements that arrived, and lean to the predictions that did."""
+        information = self._model.information(step)
+        here = tuple(j for j in self._neighbourhood if j in arrived)
+        x, P = self._x, self._P
+        told, weight, pull = np.zeros_like(x), np.zeros_like(P), np.zeros_like(x)
+        for j in here:
+            y = cast("Array | None", arrived[j]["y"])
+            if y is not None:
+                told, weight = told + information[j].gain @ y, weight + information[j].weight
+            pull = pull + (cast(Array, arrived[j]["x"]) - x)
+        M = np.linalg.solve(np.eye(len(x)) + P @ weight, P)
+        M = 0.5 * (M + M.T)
+        leaning = self._epsilon / (1.0 + float(np.linalg.norm(P))) * (P @ pull)
+        self._x, self._P = x + M @ (told - weight @ x) + leaning, M
+        return Outcome(self._x, self._P, here)
