@@ -1,4 +1,4 @@
-"""Consensus on measurements: mixing, transfer functions, predicted errors, against the reference example and sampling."""
+"""Consensus on measurements: mixing, transfer functions, predicted errors, against the reference example."""
 
 from __future__ import annotations
 
@@ -76,9 +76,7 @@ def test_predicted_errors(
 
 def test_transfer_functions(spectrum: Spectrum, observed: Observed) -> None:
     mixing = Mixing(spectrum, 2, spectrum.fastest_step)
-    np.testing.assert_allclose(
-        mixing.factors[1:], [0.2908926654, 0.0424406679, 0.0424406679, 0.2908926654], atol=1e-10
-    )
+    np.testing.assert_allclose(mixing.factors[1:], [0.2908926654, 0.0424406679, 0.0424406679, 0.2908926654], atol=1e-10)
     places = ((0, 0), (0, 2), (0, 3), (4, 9), (7, 0))
     wanted = {
         0.0: [0.3390559942, 0.2250669505, 0.0097037894, -0.0270498507, 0.0512268635],
@@ -107,7 +105,7 @@ def test_errors_in_the_frequency_domain(spectrum: Spectrum, observed: Observed) 
     """The same covariances by another route: the integral of the errors' spectrum."""
     mixing = Mixing(spectrum, 2, 0.9 / spectrum.values[-1])
     K, _ = observed.centralised
-    N, m = observed.Q.shape[:2]
+    N = len(observed.Q)
     vectors = spectrum.vectors[:, 1:]
     inverse = N * observed.pooled
     points, total = 4096, np.zeros((N, 2, 2))

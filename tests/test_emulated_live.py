@@ -13,6 +13,7 @@ from zfusion.drivers.rerun import rerun
 from zfusion.drivers.simulated import simulate
 from zfusion.links import LinkNetwork, MeasuredLinks
 from zfusion.links.measured import read_arrivals
+from zfusion.methods.check import deadline_ns
 from zfusion.model.scenario import Scenario
 from zfusion.recording import Recording
 from zfusion.stages import Message
@@ -117,7 +118,7 @@ def test_the_very_messages_are_late_that_the_simulation_says_but_for_the_time_th
     live, simulated = told(path), told(directory / "same.mcap")
     epochs, sent, latencies = first_stage(recorded(path))
     [epoch] = set(epochs.values())
-    network, deadline = LinkNetwork(scenario), scenario.timing.deadline_ns("measurement")
+    network, deadline = LinkNetwork(scenario), deadline_ns(scenario, "measurement")
     differences, unexcused = 0, []
     for i in NODES:
         for place in ((f"{i}/intermediate", step) for step in range(1, STEPS + 1)):

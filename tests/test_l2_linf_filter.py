@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tests.lmi_examples import GRAPHS, IDS, MISSING, PAIRS, run, switching, system
 from tests.simulations import walk
-
 from zfusion.drivers.links import Dropping
+
 from zfusion.drivers.replayed import verify
 from zfusion.drivers.simulated import simulate
 from zfusion.methods import METHODS

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tests.lmi_examples import GRAPHS, IDS, Arrives, designed, plant, run, stationary_system, system
 from tests.simulations import walk
-
 from zfusion.drivers.links import Dropping
+
 from zfusion.drivers.replayed import verify
 from zfusion.drivers.simulated import simulate
 from zfusion.methods import METHODS

@@ -135,7 +135,8 @@ class Decoder:
     """Reads what one sender publishes on one key.
 
     `sizes` gives the lengths that the stage's table has names for (``{"nx": 4, "ny": 2}``), `ids` the nodes that the
-    sender can name: its neighbourhood. Raises KeyError for a size that is not given.
+    sender can name: its neighbourhood. `beside`: whether the messages may hold any other fields, as those of another
+    method's stage of that name do. Raises KeyError for a size that is not given.
     """
 
     __slots__ = ("_most_bytes", "_most_elements", "_node", "_node_type", "_readers", "_stage")
@@ -147,12 +148,13 @@ class Decoder:
         *,
         sizes: Mapping[str, int] | None = None,
         ids: Iterable[NodeId] = (),
+        beside: bool = False,
     ) -> None:
         legal = frozenset(ids)
         self._stage = stage.name
         self._node = node
         self._node_type = type(node)
-        self._most_bytes, self._most_elements = _limits(stage, node, sizes or {}, legal)
+        self._most_bytes, self._most_elements = _ANY if beside else _limits(stage, node, sizes or {}, legal)
         self._readers = [(f.name, _READERS[f.kind](f.name, f.lengths(sizes or {}), legal)) for f in stage.fields]
 
     def decode(self, data: bytes) -> Message:

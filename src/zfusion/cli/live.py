@@ -213,7 +213,7 @@ def record(
     """Record a run: the recorder alone, for swarms on many machines. Ends with Ctrl-C, or when all nodes have left."""
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
-    from zfusion.methods import METHODS
+    from zfusion.methods import chosen
     from zfusion.recording.writer import RecordingWriter
 
     control = control_of(control_fd, deadly=False)
@@ -228,7 +228,7 @@ def record(
             run=name,
             method=method,
             seed=loaded.seed,
-            stages=METHODS[method].stages,
+            stages=chosen(loaded).stages,
             facts=None if network is None else {"network": network},
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))

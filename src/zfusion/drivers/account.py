@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import cast
 
+from zfusion.drivers.designs import design_of
 from zfusion.drivers.meters import Meter
 from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report, told_estimate
 from zfusion.drivers.sources import Source
-from zfusion.methods import METHODS, Setting
+from zfusion.links import Topology
+from zfusion.methods import Setting, chosen
+from zfusion.methods.check import deadline_ns
 from zfusion.methods.protocol import Method
 from zfusion.model.network import Network
 from zfusion.model.scenario import Scenario
@@ -34,12 +37,12 @@ def make_node(
     `born` and `expected` as for `Node`; `method` in the place of the scenario's, of the same stages. KeyError for a
     node that is not there.
     """
-    method = method or METHODS[scenario.method.name]
+    method = method or chosen(scenario)
     window = scenario.timing.revised_steps
     return Node(
         node,
         graph.neighbours(node),
-        method(Setting(node, scenario.system(), graph, born, window)),
+        method(setting_of(scenario, graph, node, born)),
         patience_of(scenario),
         born=born,
         expected=expected,
@@ -47,13 +50,26 @@ def make_node(
     )
 
 
+def setting_of(scenario: Scenario, graph: Network, node: NodeId, born: int) -> Setting:
+    """What the method of a node may know at the beginning of a life; `graph` is the method's."""
+    return Setting(
+        node,
+        scenario.system(),
+        graph,
+        born,
+        scenario.timing.revised_steps,
+        design=design_of(scenario),
+        mode=Topology(scenario).mode,
+    )
+
+
 def patience_of(scenario: Scenario) -> Patience:
     """How long the nodes of the scenario wait: until the stages' deadlines, or so long in each."""
     timing = scenario.timing
-    stages = [stage.name for stage in METHODS[scenario.method.name].stages]
+    stages = [stage.name for stage in chosen(scenario).stages]
     if timing.period_ns is None or timing.late == "wait":
         return Patience((timing.timeout_ns,) * len(stages), paced=False)
-    return Patience(tuple(timing.deadline_ns(stage) for stage in stages), paced=True)
+    return Patience(tuple(deadline_ns(scenario, stage) for stage in stages), paced=True)
 
 
 def truth_message(x: Array, step: int, seq: int, t_ns: int) -> Message:

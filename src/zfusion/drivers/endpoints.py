@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.network import Network
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -21,7 +21,7 @@ class Endpoints:
 
 def links_of(scenario: Scenario) -> Sequence[tuple[NodeId, NodeId]]:
     """The pairs of nodes that have a link: the neighbours in the method's graph, or all, as the scenario says."""
-    graph = METHODS[scenario.method.name].network(scenario.network)
+    graph = chosen(scenario).network(scenario.network)
     return Network.complete(graph.ids).links() if scenario.transport.mesh == "full" else graph.links()
 
 

@@ -34,7 +34,7 @@ from zfusion.drivers.transport import RECEIPT, open_session, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
@@ -89,7 +89,7 @@ class LiveNode:
         """
         self.id = node
         self._scenario, self._options, self._tell = scenario, options, tell
-        self._method = METHODS[scenario.method.name]
+        self._method = chosen(scenario)
         self._graph = self._method.network(scenario.network)
         self.phase = Phase.JOINING
         self.node: Node | None = None
@@ -209,7 +209,7 @@ class LiveNode:
         if self._tells_truth:
             self._publish[TRUTH.name] = publisher(session, keys.truth_key(run)).put
         for j in sorted(self._meeting.hears, key=self._graph.ids.index):
-            sizes = {"nx": system.nx, "ny": system.by_id[j].ny}
+            sizes = system.sizes(j)
             for stage in self._method.stages:
                 decoder = Decoder(stage, j, sizes=sizes, ids=self._graph.neighbours(j))
                 self._hearing.subscribe((j, stage.name), keys.stage_key(run, j, stage.name), decoder)

@@ -22,7 +22,7 @@ from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording.writer import RecordingWriter
@@ -157,8 +157,8 @@ class Recorder:
         system = self._scenario.system()
         if topic.node is None:
             return Decoder(topic.stage, TRUTH_SENDER, sizes={"nx": system.nx})
-        graph = METHODS[self._scenario.method.name].network(self._scenario.network)
-        sizes = {"nx": system.nx, "ny": system.by_id[topic.node].ny}
+        graph = chosen(self._scenario).network(self._scenario.network)
+        sizes = system.sizes(topic.node)
         return Decoder(topic.stage, topic.node, sizes=sizes, ids=graph.neighbours(topic.node))
 
     def _count(self) -> RecorderReport:
@@ -240,6 +240,6 @@ class Recorder:
 def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:
     """All keys that a run can have, by themselves."""
     corrected = (REVISED,) if scenario.timing.revised_steps else ()
-    stages = (*METHODS[scenario.method.name].stages, *corrected, ESTIMATE, EVENT, ARRIVALS)
+    stages = (*chosen(scenario).stages, *corrected, ESTIMATE, EVENT, ARRIVALS)
     topics = {keys.stage_key(run, i, stage.name): _Topic(i, stage) for i in scenario.ids for stage in stages}
     return topics | {keys.truth_key(run): _Topic(None, TRUTH)}

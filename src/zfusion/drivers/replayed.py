@@ -32,12 +32,14 @@ from typing import cast
 import numpy as np
 
 from zfusion import keys
+from zfusion.drivers.account import setting_of
 from zfusion.drivers.lives import Doubt, Life, Place, Shelf
 from zfusion.drivers.verdict import NAMED, TOLERANCE, Difference, Tally, Verdict
-from zfusion.errors import InputError, MessageError
+from zfusion.errors import MessageError
 from zfusion.gaps import MAX_LIVES
 from zfusion.messages import Decoder, Reason, encode_any
-from zfusion.methods import METHODS, Fields, Setting
+from zfusion.methods import Fields, chosen
+from zfusion.methods.check import check_method
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node, Patience
@@ -84,9 +86,10 @@ class _Verifier:
 
     def __init__(self, scenario: Scenario, nodes: Collection[NodeId], complete: bool, tolerance: float | None) -> None:
         self._scenario, self._complete, self._tolerance = scenario, complete, tolerance
-        self._method = METHODS[scenario.method.name]
+        self._method = chosen(scenario)
         self._graph = self._method.network(scenario.network)
         self._tables = {stage.name: stage for stage in (*self._method.stages, ESTIMATE, REVISED, EVENT)}
+        self._first = self._method.stages[0]
         self._stages = [stage.name for stage in self._method.stages]
         self._published = [*self._stages, ESTIMATE.name]
         self._order = {stage: number for number, stage in enumerate((*self._published, REVISED.name))}
@@ -137,7 +140,7 @@ class _Verifier:
 
     def _decoder(self, node: NodeId, stage: str) -> Decoder:
         system = self._scenario.system()
-        sizes = {"nx": system.nx, "ny": system.by_id[node].ny}
+        sizes = system.sizes(node)
         return Decoder(self._tables[stage], node, sizes=sizes, ids=self._graph.neighbours(node))
 
     def _take_message(self, message: Message) -> None:
@@ -279,7 +282,9 @@ class _Verifier:
         node = life.node = life.node or self._make(life)
         for of, answer in life.told.pop(step, ()):
             node.learn_history(of, answer.born, answer.end, answer.runs)
-        node.begin(step, self._measured(life, said[0], said[1]), 0)
+        begun = node.begin(step, self._measured(life, said[0], said[1]), 0)
+        if said[0] is not None and self._first is not MEASUREMENT:  # what it says beside the measurement itself
+            self._judge(life, said[0], next(m for m in begun if isinstance(m, Message) and m.stage == said[0].stage))
         for number, stage in enumerate(self._stages):
             following = said[number + 1]
             if following is not None:
@@ -298,7 +303,7 @@ class _Verifier:
             self._judge_corrections(life, step)
 
     def _make(self, life: Life) -> Node:
-        method = self._method(Setting(life.id, self._scenario.system(), self._graph, life.born, self._window))
+        method = self._method(setting_of(self._scenario, self._graph, life.id, life.born))
         return Node(
             life.id,
             (*self._graph.neighbours(life.id), self._nobody),
@@ -344,7 +349,7 @@ class _Verifier:
         newest = max(self._shelves[j].by_stage[stage], default=0)
         cut_off = not self._complete and newest < step
         self._miss(life, f"{stage} of node {j}, step {step}, which node {life.id} used", cut_off=cut_off)
-        if stage != MEASUREMENT.name:
+        if stage != MEASUREMENT.name or self._first is not MEASUREMENT:
             return None
         born = life.heard.get(j, max((born for born in self._lives[j] if born <= step), default=1))
         return Message(j, step, stage, 0, born, 0, {"y": self._stand_in(j)})
@@ -490,13 +495,11 @@ def _verify_some(recording: Recording, scenario: Scenario, nodes: Sequence[NodeI
 
 
 def recorded_scenario(recording: Recording) -> Scenario:
-    """The scenario of a recording; ScenarioError if it cannot be read, InputError for an unknown method."""
+    """The scenario of a recording; ScenarioError if it cannot be read, or its method is unknown here."""
     scenario = Scenario.from_toml(
         recording.scenario_toml, f"{recording.path}: scenario.toml", recording.path.absolute().parent
     )
-    if scenario.method.name not in METHODS:
-        known = ", ".join(METHODS)
-        raise InputError(f"{recording.path}: its method is {scenario.method.name!r}; this zfusion knows {known}")
+    check_method(scenario, f"{recording.path}: scenario.toml")
     return scenario
 
 

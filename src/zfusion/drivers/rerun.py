@@ -24,7 +24,7 @@ from zfusion.drivers.sources import TableSource
 from zfusion.errors import InputError, MessageError
 from zfusion.links import Link
 from zfusion.messages import Decoder
-from zfusion.methods import METHODS
+from zfusion.methods import chosen as method_of
 from zfusion.model.scenario import Overrides, Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.recording.reader import Recording
@@ -149,7 +149,10 @@ def read_recorded(recording: Recording, scenario: Scenario) -> Recorded:
     """All measurements and truths, of two of one step the first; InputError for a sensor of which there is nothing."""
     system, run = scenario.system(), recording.metadata["run"]
     readers: dict[str, tuple[NodeId, Decoder]] = {
-        keys.stage_key(run, i, MEASUREMENT.name): (i, Decoder(MEASUREMENT, i, sizes={"ny": system.by_id[i].ny}))
+        keys.stage_key(run, i, MEASUREMENT.name): (
+            i,
+            Decoder(MEASUREMENT, i, sizes={"ny": system.by_id[i].ny}, beside=True),
+        )
         for i in scenario.ids
     }
     readers[keys.truth_key(run)] = (TRUTH_SENDER, Decoder(TRUTH, TRUTH_SENDER, sizes={"nx": system.nx}))
@@ -214,7 +217,7 @@ _Place = tuple[NodeId, int]
 def _estimates(recording: Recording, scenario: Scenario, chosen: Scenario) -> Iterator[Message]:
     """The estimates of those nodes that both scenarios have."""
     run, system = recording.metadata["run"], scenario.system()
-    graph = METHODS[scenario.method.name].network(scenario.network)
+    graph = method_of(scenario).network(scenario.network)
     decoders = {
         keys.stage_key(run, i, ESTIMATE.name): Decoder(ESTIMATE, i, sizes={"nx": system.nx}, ids=graph.neighbours(i))
         for i in scenario.ids

@@ -20,7 +20,7 @@ from zfusion.drivers.sources import Source, open_sources
 from zfusion.links import Kill, Link, LinkNetwork, Timeline, links_of
 from zfusion.links.protocol import EPOCH_NS
 from zfusion.messages import decode_any, encode
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.node import Ask, Effect, Node
@@ -92,9 +92,9 @@ class Simulation:
         self._link = links_of(scenario) if link is None else link
         self._timeline = Timeline(scenario)
         self._method = method
-        self._graph = METHODS[scenario.method.name].network(scenario.network)
+        self._graph = chosen(scenario).network(scenario.network)
         self._sources = open_sources(scenario, self._graph.ids) if sources is None else sources
-        self._stages = [stage.name for stage in METHODS[scenario.method.name].stages]
+        self._stages = [stage.name for stage in chosen(scenario).stages]
         self._exchanged = set(self._stages)
         self._key = partial(keys.stage_key, run)
         self._truth_key = keys.truth_key(run)
@@ -498,7 +498,7 @@ def simulate(
         run=run,
         method=method,
         seed=scenario.seed,
-        stages=METHODS[method].stages,
+        stages=chosen(scenario).stages,
         facts={"world": "simulated"},
     ) as writer:
         simulation = Simulation(scenario, run=run, link=link, record=writer.write, sources=sources, observe=observe)

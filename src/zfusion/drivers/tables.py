@@ -67,7 +67,9 @@ def recorded_measurements(path: str, node: NodeId, ny: int, nx: int) -> tuple[By
         topic = keys.stage_key(run, node, MEASUREMENT.name)
         if topic not in recording.topics:
             raise InputError(f"{path}: has no measurements of sensor {node}: there is no topic {topic}")
-        measurements, refusals = _decoded(recording, topic, Decoder(MEASUREMENT, node, sizes={"ny": ny}), "y")
+        measurements, refusals = _decoded(
+            recording, topic, Decoder(MEASUREMENT, node, sizes={"ny": ny}, beside=True), "y"
+        )
         if refusals and not measurements:
             raise InputError(f"{path}: nothing on {topic} can be a measurement of sensor {node}: {refusals[0]}")
         # refused, all of it, where the recorded state has another size than ours

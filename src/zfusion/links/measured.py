@@ -15,7 +15,8 @@ from zfusion import keys
 from zfusion.errors import MessageError
 from zfusion.links.protocol import EPOCH_NS, Edge
 from zfusion.messages import Decoder
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
+from zfusion.methods.check import deadline_ns
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording.reader import Recording
@@ -105,14 +106,14 @@ class _Found:
         period = scenario.timing.period_ns
         if period is None:
             return Passage(latency or 0, latency or 0)
-        due, deadline = self.epoch_ns + step * period, scenario.timing.deadline_ns(stage)
+        due, deadline = self.epoch_ns + step * period, deadline_ns(scenario, stage)
         after = deadline if latency is None else sent_ns + latency - due
         after = min(after, deadline) if sender in used else max(after, deadline + 1)
         return Passage(due + after - sent_ns if latency is None else latency, after)
 
 
 def _read(recording: Recording, scenario: Scenario) -> _Found:
-    method = METHODS[scenario.method.name]
+    method = chosen(scenario)
     graph = method.network(scenario.network)
     stages = [stage.name for stage in method.stages]
     before = dict(zip([*stages[1:], ESTIMATE.name], stages, strict=True))
@@ -137,12 +138,10 @@ def _read(recording: Recording, scenario: Scenario) -> _Found:
 
 def _messages(recording: Recording, scenario: Scenario) -> Iterator[Message]:
     """All legal messages of the scenario's nodes."""
-    method, system, run = METHODS[scenario.method.name], scenario.system(), recording.metadata["run"]
+    method, system, run = chosen(scenario), scenario.system(), recording.metadata["run"]
     graph = method.network(scenario.network)
     decoders = {
-        keys.stage_key(run, i, stage.name): Decoder(
-            stage, i, sizes={"nx": system.nx, "ny": system.by_id[i].ny}, ids=graph.neighbours(i)
-        )
+        keys.stage_key(run, i, stage.name): Decoder(stage, i, sizes=system.sizes(i), ids=graph.neighbours(i))
         for i in graph.ids
         for stage in (*method.stages, ESTIMATE, EVENT, ARRIVALS)
     }

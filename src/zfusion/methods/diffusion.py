@@ -15,9 +15,9 @@ from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.white import White, kalman_update
-from zfusion.model.network import Network
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -37,11 +37,6 @@ class Diffusion:
 
     name: ClassVar[str] = "diffusion"
     stages: ClassVar[tuple[Stage, ...]] = (MEASUREMENT, PSI)
-
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
 
     def __init__(self, setting: Setting) -> None:
         self._neighbourhood = setting.network.neighbours(setting.node)
@@ -70,3 +65,6 @@ class Diffusion:
             return {"x": self._x, "used": tuple(used)}
         self._x = np.mean([cast(Array, arrived[j]["x"]) for j in here], axis=0)
         return Outcome(self._x, self._P, tuple(here))
+
+
+DIFFUSION = Family(Diffusion.name, Diffusion, stages=lambda _: Diffusion.stages)

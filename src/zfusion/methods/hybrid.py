@@ -21,6 +21,7 @@ from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family
 from zfusion.methods.packing import packed, unpacked
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.white import White
@@ -55,6 +56,13 @@ class HybridOptions:
             raise ModelError("rounds", self.rounds, f"expected a whole number from 1 to {MOST_ROUNDS}")
 
 
+def stages(options: HybridOptions) -> tuple[Stage, ...]:
+    """One for each exchange; in the first the measurement itself, from which the neighbours see its information."""
+    later = (*PRIOR, *NEWS, Field("used", Kind.IDS, (), "whose values of the exchange before went in"))
+    first = Stage(MEASUREMENT.name, (*MEASUREMENT.fields, *PRIOR), "what a sensor measured and a node believes")
+    return (first, *(Stage(f"mix{n}", later, f"exchange {n} of a step") for n in range(2, options.rounds + 1)))
+
+
 def metropolis(network: Network, node: NodeId) -> dict[NodeId, float]:
     """π_ij = 1 / (1 + max(d_i, d_j)) for the neighbours j of i, and the rest for i itself; d without the node itself.
 
@@ -70,19 +78,9 @@ class Hybrid:
 
     name: ClassVar[str] = "hybrid_consensus"
 
-    @staticmethod
-    def stages(options: HybridOptions) -> tuple[Stage, ...]:
-        """One for each exchange; in the first the measurement itself, from which the neighbours see its information."""
-        later = (*PRIOR, *NEWS, Field("used", Kind.IDS, (), "whose values of the exchange before went in"))
-        first = Stage(MEASUREMENT.name, (*MEASUREMENT.fields, *PRIOR), "what a sensor measured and a node believes")
-        return (first, *(Stage(f"mix{n}", later, f"exchange {n} of a step") for n in range(2, options.rounds + 1)))
-
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
-
-    def __init__(self, setting: Setting, options: HybridOptions) -> None:
+    def __init__(self, setting: Setting) -> None:
+        options = cast(HybridOptions, setting.options)
+        self.stages = stages(options)
         self._node, self._rounds = setting.node, options.rounds
         self._neighbourhood = setting.network.neighbours(setting.node)
         self._weights = metropolis(setting.network, setting.node)
@@ -128,3 +126,6 @@ class Hybrid:
         else:
             dq, weight = sensor.gain @ y, 0.5 * (sensor.weight + sensor.weight.T)
         return {**fields, "dq": dq, "domega": packed(weight)}
+
+
+HYBRID = Family(Hybrid.name, Hybrid, stages=stages, options=HybridOptions)

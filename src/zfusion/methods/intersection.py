@@ -17,9 +17,9 @@ from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.white import White, kalman_update
-from zfusion.model.network import Network
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -69,11 +69,6 @@ class Intersection:
     name: ClassVar[str] = "covariance_intersection"
     stages: ClassVar[tuple[Stage, ...]] = (LOCAL,)
 
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
-
     def __init__(self, setting: Setting) -> None:
         self._node, self._neighbourhood = setting.node, setting.network.neighbours(setting.node)
         self._model = White(setting.system, (setting.node,))
@@ -102,3 +97,6 @@ class Intersection:
             for weight, covariance, j in zip(weights, covariances, here, strict=True)
         ]
         return Outcome(P @ np.sum(told, axis=0), P, here)
+
+
+INTERSECTION = Family(Intersection.name, Intersection, stages=lambda _: Intersection.stages)

@@ -7,34 +7,45 @@
 M_i is what the filter reports: the covariance of a filter without the last term, not of the error of this one.
 
 Source: Olfati-Saber, "Kalman-consensus filter: optimality, stability, and performance", Proc. 48th IEEE CDC (2009)
-7036-7042, Algorithm 1; the filter itself is from his "Distributed Kalman filtering for sensor networks", 46th CDC (2007).
+7036-7042, Algorithm 1; the filter itself is from his "Distributed Kalman filtering for sensor networks", 46th CDC
+(2007) 5492-5498.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.white import White
-from zfusion.model.network import Network
+from zfusion.model.checks import ModelError
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
 
-EPSILON = 0.05
-"""ε where nothing else is said: small beside the step, as the source has it."""
-
-PREDICTION = Stage(
-    "prediction",
-    (
-        Field("y", Kind.OPTIONAL_VECTOR, ("ny",), "the sensor's reading of this step; nil if it had none"),
-        Field("x", Kind.VECTOR, ("nx",), "the state as it was predicted before this reading"),
-    ),
-    "what a sensor measured and what it had expected the state to be",
+EXPECTATION = Stage(
+    MEASUREMENT.name,
+    (*MEASUREMENT.fields, Field("x", Kind.VECTOR, ("nx",), "the state as it was predicted before this reading")),
+    "what a sensor measured, and what it had expected the state to be",
 )
+
+
+@dataclass(frozen=True)
+class KalmanConsensusOptions:
+    """What a scenario may say of the method."""
+
+    epsilon: float = 0.05
+    """ε >= 0: how much it leans to its neighbours; small beside the step, as the source has it."""
+
+    def __post_init__(self) -> None:
+        number = isinstance(self.epsilon, int | float) and not isinstance(self.epsilon, bool)
+        if not number or not 0.0 <= self.epsilon < inf:
+            raise ModelError("epsilon", self.epsilon, "expected a number >= 0")
 
 
 class KalmanConsensus:
@@ -43,16 +54,11 @@ class KalmanConsensus:
     name: ClassVar[str] = "kalman_consensus"
     stages: ClassVar[tuple[Stage, ...]] = (EXPECTATION,)
 
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
-
-    def __init__(self, setting: Setting, epsilon: float = EPSILON) -> None:
+    def __init__(self, setting: Setting) -> None:
         self._neighbourhood = setting.network.neighbours(setting.node)
         self._model = White(setting.system, self._neighbourhood)
         self._x, self._P = self._model.before(setting.born)
-        self._epsilon = epsilon
+        self._epsilon = cast(KalmanConsensusOptions, setting.options).epsilon
 
     def begin(self, step: int, y: Array | None) -> Fields:
         """The measurement and the prediction."""
@@ -79,3 +85,8 @@ class KalmanConsensus:
         leaning = self._epsilon / (1.0 + float(np.linalg.norm(P))) * (P @ pull)
         self._x, self._P = x + M @ (told - weight @ x) + leaning, M
         return Outcome(self._x, self._P, here)
+
+
+KALMAN_CONSENSUS = Family(
+    KalmanConsensus.name, KalmanConsensus, stages=lambda _: KalmanConsensus.stages, options=KalmanConsensusOptions
+)

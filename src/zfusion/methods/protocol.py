@@ -7,10 +7,10 @@ arrived, publishes the next stage, and so on, until `advance` of the last stage 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from zfusion.model.network import Network
 from zfusion.model.system import System
@@ -34,6 +34,12 @@ class Setting:
     """First step of this life; a node that was restarted begins later, from the prior, having used nothing before."""
     window: int = 0
     """Steps that `Revising.revise` and `Revising.correct` may go back."""
+    options: Any = None
+    """What the scenario says of the method, as `Family.options` holds it."""
+    design: Any = None
+    """What was computed off-line for all nodes, where the method has that: `Designing`."""
+    mode: Callable[[int], int] = lambda _: 0
+    """The mode of the topology at a step, the same at all nodes; 0 where it does not switch."""
 
 
 class Outcome(NamedTuple):
@@ -54,16 +60,9 @@ class Outcome(NamedTuple):
 class Method(Protocol):
     """One estimator at one node. Deterministic: the same calls give the same results, bit for bit."""
 
-    name: ClassVar[str]
-    stages: ClassVar[tuple[Stage, ...]]
-    revises: ClassVar[bool]
-    """Whether it is `Revising`: it can take in what comes late."""
-
-    def __init__(self, setting: Setting) -> None: ...
-
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The graph whose neighbourhoods the method uses, given the scenario's."""
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """The exchanges of a step."""
 
     def begin(self, step: int, y: Array | None) -> Fields:
         """Fields of the first stage, from the own measurement (ny,), None where the sensor had none."""

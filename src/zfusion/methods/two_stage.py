@@ -16,6 +16,7 @@ from typing import ClassVar, NamedTuple, cast
 import numpy as np
 
 from zfusion.methods.covariances import State
+from zfusion.methods.family import Family
 from zfusion.methods.fusion import fuse, fusion_weights
 from zfusion.methods.least_squares import LeastSquaresFilter, Standing
 from zfusion.methods.neighbourhood import Neighbourhood, StepModels
@@ -209,3 +210,15 @@ class _Weights:
             and fused == self.fused
             and (prior is self.prior or np.array_equal(prior.covariance, self.prior.covariance))
         )
+
+
+TWO_STAGE, LOCAL, CENTRALIZED = (
+    Family(
+        method.name,
+        method,
+        stages=lambda _, stages=method.stages: stages,  # type: ignore[misc]
+        network=method.network,
+        revises=method.revises,
+    )
+    for method in (TwoStage, Local, Centralized)
+)

@@ -58,7 +58,7 @@ class White:
             self._of, self._information = model, {}
             for i, rows in self._rows.items():
                 H = model.H[rows]
-                gain = np.linalg.solve(model.R[rows, rows], H).T
+                gain: Array = np.linalg.solve(model.R[rows, rows], H).T.astype(np.float64, copy=False)
                 self._information[i] = Information(gain, gain @ H)
         return self._information
 

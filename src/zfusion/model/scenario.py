@@ -209,7 +209,10 @@ class Scenario(Spec):
             sensor.model_copy(update={"source": sensor.source.with_paths(here)}) if sensor.source else sensor
             for sensor in self.sensors
         )
-        pieces = {name: getattr(self, name).with_paths(here) for name in ("source", "transport", "recording", "links")}
+        pieces = {
+            name: getattr(self, name).with_paths(here)
+            for name in ("source", "transport", "recording", "links", "method")
+        }
         changed = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
         document = self._document() | changed | {"sensors": sensors}
         return self._from_document(document, self._origin, self._directory)
@@ -245,7 +248,7 @@ class Scenario(Spec):
             "noise": self.noise.model_dump(exclude_none=True),
             "network": [(i, self.network.neighbours(i)) for i in self.ids],
             "weights": sorted(self.network.weights.items()),
-            "method": self.method.model_dump(),
+            "method": self.method.with_paths(_file_name).model_dump(exclude_none=True),
             "timing": self.timing.facts,
             "links": self.links.with_paths(_file_name).facts,
             "faults": [fault.model_dump(exclude_none=True) for fault in self.faults],

@@ -60,6 +60,10 @@ class System:
         """All sensors' ids, sorted."""
         return tuple(self.by_id)
 
+    def sizes(self, i: NodeId) -> dict[str, int]:
+        """Lengths of what node i tells: nx, ny, and nxx of a triangle of an (nx, nx) matrix. KeyError as `chosen`."""
+        return {"nx": self.nx, "nxx": self.nx * (self.nx + 1) // 2, "ny": self.by_id[i].ny}
+
     def chosen(self, ids: Iterable[NodeId]) -> tuple[Sensor, ...]:
         """The sensors of these ids, in this order; KeyError for an unknown one."""
         return tuple(self.by_id[i] for i in ids)

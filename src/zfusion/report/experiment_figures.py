@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from zfusion.errors import ZfusionError
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.report.figures import curves, heat_map, latency, over_time, topology
@@ -345,13 +345,13 @@ def networks(results: Results) -> Picture | None:
     for point in sorted(results.points, key=lambda p: -errors.get(p.number, NOTHING).mean):
         scenario = _scenario_of(results, point)
         if scenario is not None and point.number in errors:
-            graph = METHODS[scenario.method.name].network(scenario.network)
+            graph = chosen(scenario).network(scenario.network)
             worst.setdefault(repr(graph.neighbourhoods), (point, scenario))
     if not worst:
         return None
     graphs = []
     for point, scenario in sorted(worst.values(), key=lambda item: item[0].number)[:MOST_NETWORKS]:
-        graph = METHODS[scenario.method.name].network(scenario.network)
+        graph = chosen(scenario).network(scenario.network)
         rule = scenario.network_spec.model_dump(by_alias=True, exclude_none=True)
         at = topology.place(graph.ids, rule if graph == scenario.network else {})
         values: dict[NodeId, float] = {

@@ -19,7 +19,8 @@ from zfusion import keys
 from zfusion.drivers.replayed import recorded_scenario
 from zfusion.errors import MessageError
 from zfusion.messages import Decoder
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
+from zfusion.methods.check import deadline_ns
 from zfusion.model.network import Edge, Network
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
@@ -114,7 +115,7 @@ class RunFacts:
         """Reads the recording. Raises as `recorded_scenario` does."""
         self.recording = recording
         self.scenario: Scenario = recorded_scenario(recording)
-        method = METHODS[self.scenario.method.name]
+        method = chosen(self.scenario)
         self.network: Network = method.network(self.scenario.network)
         """The method's graph."""
         self.stages = tuple(stage.name for stage in method.stages)
@@ -211,7 +212,7 @@ class RunFacts:
             if timing.period_ns is not None and epoch is not None:
                 due = epoch + step * timing.period_ns
                 waits = getattr(timing, "late", "drop") == "wait"
-                deadlines = {} if waits else {s: due + timing.deadline_ns(s) for s in self.stages}
+                deadlines = {} if waits else {s: due + deadline_ns(self.scenario, s) for s in self.stages}
                 rounds.append(Round(step, due, deadlines))
             elif sent := [f.sent_ns for f in flights if f.step == step]:
                 rounds.append(Round(step, min(sent), {}))
@@ -282,7 +283,7 @@ class RunFacts:
                     yield topic, Decoder(TRUTH, TRUTH_SENDER, sizes={"nx": system.nx})
                 elif key.stage in self._tables:
                     node = self.scenario.node_id(key.node or "")
-                    sizes = {"nx": system.nx, "ny": system.by_id[node].ny}
+                    sizes = system.sizes(node)
                     table, ids = self._tables[key.stage], self.network.neighbours(node)
                     yield topic, Decoder(table, node, sizes=sizes, ids=ids)
 

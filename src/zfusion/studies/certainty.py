@@ -17,7 +17,7 @@ import numpy as np
 from zfusion.links import Edge
 from zfusion.links.rules import Rules
 from zfusion.links.traces import read_trace
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.methods.ensemble import Arcs
 from zfusion.model.scenario import Scenario
 from zfusion.model.schema.links import (
@@ -72,7 +72,7 @@ def certainty(scenario: Scenario) -> Certainty | None:
     if not all(isfinite(longest) for _, longest in bounds.values()):
         return None
     loss = {place: _loss(rule) for place, rule in rules.items()}
-    first = METHODS[scenario.method.name].stages[0].name
+    first = chosen(scenario).stages[0].name
     best = fate_of(_extreme(scenario, lambda place: (bounds[place][0], float(loss[place] == 1))))
     slow = fate_of(_extreme(scenario, lambda place: (bounds[place][1], float(loss[place] == 1))))
     bare = fate_of(
@@ -88,7 +88,7 @@ def certainty(scenario: Scenario) -> Certainty | None:
 
 def _probabilities(scenario: Scenario, best: Fate, loss: Mapping[Place, float]) -> tuple[Array, Array]:
     arcs = Arcs(method_network(scenario).neighbourhoods)
-    stages = [stage.name for stage in METHODS[scenario.method.name].stages]
+    stages = [stage.name for stage in chosen(scenario).stages]
     kept = {
         stage: np.tile([1.0 if i == j else 1.0 - loss[(j, i), stage] for i, j in arcs.pairs], (scenario.steps, 1))
         for stage in stages
@@ -106,7 +106,7 @@ def _rules(scenario: Scenario) -> dict[Place, Rules]:
         ((j, i), stage.name): Rules.of(scenario.links, (j, i), stage.name)
         for i in network.ids
         for j in network.neighbours(i)
-        for stage in METHODS[scenario.method.name].stages
+        for stage in chosen(scenario).stages
         if i != j
     }
 

@@ -20,7 +20,7 @@ from zfusion.drivers.rerun import Recorded, read_recorded
 from zfusion.drivers.simulated import Simulation
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Decoder
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.sampling import SamplePath
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
@@ -230,7 +230,7 @@ def _simulated_estimates(scenario: Scenario) -> Iterator[Message]:
 
 def _recorded_estimates(recording: Recording, scenario: Scenario) -> Iterator[Message]:
     run, nx = recording.metadata["run"], scenario.system().nx
-    graph = METHODS[scenario.method.name].network(scenario.network)
+    graph = chosen(scenario).network(scenario.network)
     decoders = {
         keys.stage_key(run, i, ESTIMATE.name): Decoder(ESTIMATE, i, sizes={"nx": nx}, ids=graph.neighbours(i))
         for i in scenario.ids

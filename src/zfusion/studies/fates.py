@@ -17,7 +17,7 @@ import numpy as np
 
 from zfusion.drivers.simulated import Simulation
 from zfusion.errors import InputError
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.methods.ensemble import Arcs
 from zfusion.methods.layout import Bools
 from zfusion.methods.protocol import Fields, Outcome, Setting
@@ -57,7 +57,7 @@ def covered(scenario: Scenario) -> None:
 
 def method_network(scenario: Scenario) -> Network:
     """The graph whose neighbourhoods the scenario's method uses."""
-    return METHODS[scenario.method.name].network(scenario.network)
+    return chosen(scenario).network(scenario.network)
 
 
 def fate_of(scenario: Scenario) -> Fate:
@@ -86,7 +86,7 @@ class _Told:
         self.made = np.zeros((steps, len(network.ids)), dtype=np.bool_)
         self.begins = np.zeros_like(self.made)
         self.taken: list[tuple[int, int, int]] = []
-        self._made = _Fusing if len(METHODS[scenario.method.name].stages) > 1 else _Bookkeeper
+        self._made = _Fusing if len(chosen(scenario).stages) > 1 else _Bookkeeper
 
     def bookkeeper(self, setting: Setting) -> _Bookkeeper:
         """For one life of a node."""

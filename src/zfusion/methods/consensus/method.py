@@ -21,11 +21,13 @@ from typing import ClassVar, Literal, cast
 import numpy as np
 
 from zfusion.methods.consensus.mixing import Mixing, Spectrum
+from zfusion.methods.family import Family
 from zfusion.methods.packing import packed, unpacked
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.white import White
 from zfusion.model.checks import ModelError
 from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger, UsedSet
@@ -70,6 +72,13 @@ class ConsensusOptions:
         return Mixing(spectrum, self.rounds, step, self.chebyshev)
 
 
+def stages(options: ConsensusOptions) -> tuple[Stage, ...]:
+    """One for each exchange; with the first comes the measurement itself, for whoever records."""
+    first = Stage(MEASUREMENT.name, (*MEASUREMENT.fields, *SHARE), "what a sensor measured, and its node's share")
+    later = (*SHARE, Field("used", Kind.IDS, (), "whose shares of the exchange before were mixed in"))
+    return (first, *(Stage(f"mix{n}", later, f"exchange {n} of a step") for n in range(2, options.rounds + 1)))
+
+
 def _weights(network: Network) -> Array:
     place = {node: n for n, node in enumerate(network.ids)}
     a = np.zeros((len(place), len(place)))
@@ -84,20 +93,10 @@ class Consensus:
 
     name: ClassVar[str] = "consensus"
 
-    @staticmethod
-    def stages(options: ConsensusOptions) -> tuple[Stage, ...]:
-        """One for each exchange; with the first comes the measurement itself, for whoever records."""
-        first = Stage(MEASUREMENT.name, (*MEASUREMENT.fields, *SHARE), "what a sensor measured, and its node's share")
-        later = (*SHARE, Field("used", Kind.IDS, (), "whose shares of the exchange before were mixed in"))
-        return (first, *(Stage(f"mix{n}", later, f"exchange {n} of a step") for n in range(2, options.rounds + 1)))
-
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
-
-    def __init__(self, setting: Setting, options: ConsensusOptions) -> None:
+    def __init__(self, setting: Setting) -> None:
         """ModelError for a network that is directed or falls apart."""
+        options = cast(ConsensusOptions, setting.options)
+        self.stages = stages(options)
         self._node = setting.node
         self._neighbourhood = setting.network.neighbours(setting.node)
         mixing = options.mixing(setting.network)
@@ -155,3 +154,17 @@ class Consensus:
         P = np.linalg.inv(information)
         self._P = 0.5 * (P + P.T)
         self._s = self._P @ (prior @ self._s + self._count * self._share[:nx])
+
+
+def _check(options: ConsensusOptions, _: System, network: Network) -> None:
+    options.mixing(network)
+
+
+CONSENSUS = Family(
+    Consensus.name,
+    Consensus,
+    stages=stages,
+    options=ConsensusOptions,
+    check=_check,
+    note="consensus: a message that is lost one way only biases the estimates of the whole network for good",
+)

@@ -47,7 +47,7 @@ class Spectrum:
         Raises ModelError, with nodes by their `names`, unless they are finite, >= 0, symmetric, and connect all nodes.
         """
         a = np.array(weights, dtype=np.float64)
-        named = list(range(len(a))) if names is None else list(names)
+        named: list[object] = list(range(len(a)) if names is None else names)
         _check(a, named)
         np.fill_diagonal(a, 0.0)
         values, vectors = np.linalg.eigh(np.diag(a.sum(axis=1)) - a)

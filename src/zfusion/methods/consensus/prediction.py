@@ -5,7 +5,7 @@
 Node i follows x_i(t), its share of Σ Q_j^-1 y_j(t), by adding the change of Q_i^-1 y_i and then mixing n times; mode l
 of what the nodes disagree in passes through T_l(z) = a_l (z - 1) / (z - a_l). Constant Q_i, and M_i settled.
 
-Source: the setting is that of Spanos, Olfati-Saber, Murray, IPSN 2005; the formulas are derived in docs/methods/consensus.md.
+Source: the setting is that of Spanos, Olfati-Saber, Murray, IPSN 2005; for the formulas see docs/methods/consensus.md.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Observed:
     @cached_property
     def information(self) -> Array:
         """Q_i^-1, (N, m, m)."""
-        return np.linalg.inv(self.Q)
+        return np.asarray(np.linalg.inv(self.Q), dtype=np.float64)
 
     @cached_property
     def pooled(self) -> Array:
@@ -60,7 +60,7 @@ class Observed:
 def steady_filter(A: Array, C: Array, W: Array, R: Array) -> tuple[Array, Array]:
     """K = S Cᵀ (C S Cᵀ + R)^-1 and (I - K C) S, for S the stationary covariance of the prediction."""
     S = predictor(A, C, W, R)
-    K = np.linalg.solve(C @ S @ C.T + R, C @ S).T
+    K: Array = np.linalg.solve(C @ S @ C.T + R, C @ S).T.astype(np.float64, copy=False)
     P = (np.eye(len(A)) - K @ C) @ S
     return K, 0.5 * (P + P.T)
 

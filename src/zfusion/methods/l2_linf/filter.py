@@ -13,17 +13,21 @@ cancels the neighbour out. A reading that a message says is not there is what it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family, Modes
 from zfusion.methods.gramians import lyapunov
 from zfusion.methods.l2_linf.design import METHOD, Design
+from zfusion.methods.l2_linf.mapping import problem_of
 from zfusion.methods.l2_linf.options import L2LinfOptions
 from zfusion.methods.l2_linf.problem import Problem, closed
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -34,12 +38,6 @@ PREDICTION = Stage(
     "what a sensor measured, and what its node had expected of the state",
 )
 """The stage of the measurements, for whoever records or scores them, with x̂ beside them."""
-
-Modes = Callable[[int], int]
-"""The mode of a step: the same at all nodes."""
-
-
-DEFAULT = L2LinfOptions()
 
 REMEMBERED = 2048
 """Steps before a node's birth of which it goes through the modes, to know P: a tenth of a second; older ones are
@@ -57,25 +55,9 @@ class L2Linf:
     name: ClassVar[str] = METHOD
     stages: ClassVar[tuple[Stage, ...]] = (PREDICTION,)
 
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph: of all that some mode joins."""
-        return graph
-
-    def __init__(
-        self,
-        setting: Setting,
-        options: L2LinfOptions = DEFAULT,
-        design: Design | None = None,
-        modes: Modes = lambda step: 0,  # noqa: ARG005
-    ) -> None:
-        """`design` must be the same at all nodes; without it, the node makes one for the one graph of the setting.
-
-        DesignError where there is none for this system.
-        """
-        system = setting.system
-        if design is None:
-            design = options.design(system, [setting.network])
+    def __init__(self, setting: Setting) -> None:
+        """The setting's design must be the same at all nodes."""
+        system, design, modes = setting.system, cast(Design, setting.design), setting.mode
         self._problem, self._modes = design.problem, modes
         self._position = {j: n for n, j in enumerate(design.ids)}
         self._neighbourhood = setting.network.neighbours(setting.node)
@@ -172,3 +154,29 @@ class _Moments:
             moved[nx:, nx:] += lost @ seen @ lost.T
         self._P = 0.5 * (moved + moved.T)
         self._mean = problem.A @ self._mean
+
+
+class _Designer:
+    """See `Designer`; what the modes join is what the network may be."""
+
+    @staticmethod
+    def make(options: L2LinfOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
+        return options.design(system, modes.networks, modes.transition)
+
+    @staticmethod
+    def load(path: Path, options: L2LinfOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
+        return Design.load(path, options.fingerprint(system, modes.networks, modes.transition))
+
+
+def _check(options: L2LinfOptions, system: System, network: Network) -> None:
+    problem_of(system, [network], ((1.0,),), options.output)
+
+
+L2_LINF = Family(
+    L2Linf.name,
+    L2Linf,
+    stages=lambda _: L2Linf.stages,
+    options=L2LinfOptions,
+    designer=_Designer(),
+    check=_check,
+)

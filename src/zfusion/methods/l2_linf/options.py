@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zfusion.methods.l2_linf.design import Design, make_design
+from zfusion.methods.l2_linf.design import Design, fingerprint, make_design
 from zfusion.methods.l2_linf.lmi import Form
 from zfusion.methods.l2_linf.mapping import problem_of
 from zfusion.model.checks import ModelError, finite_array
@@ -37,6 +37,10 @@ class L2LinfOptions:
                 raise ModelError(name, getattr(self, name), "expected true or false")
         if self.output is not None:
             finite_array("output", np.asarray(self.output), (None, None))
+
+    def fingerprint(self, system: System, modes: Sequence[Network], transition: ArrayLike = ((1.0,),)) -> str:
+        """Of what is designed for; InputError as `problem_of`."""
+        return fingerprint(system.ids, problem_of(system, modes, transition, self.output))
 
     def design(self, system: System, modes: Sequence[Network], transition: ArrayLike = ((1.0,),)) -> Design:
         """Design filters for all modes. DesignError and InputError as `problem_of` and `make_design`."""

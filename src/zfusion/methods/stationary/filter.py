@@ -12,16 +12,20 @@ estimate is unbiased from the first step on, and its covariance is known from th
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.family import Family, Modes
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.stationary.cost import evaluate, extended
 from zfusion.methods.stationary.design import METHOD, Design
+from zfusion.methods.stationary.mapping import problem_of
 from zfusion.methods.stationary.options import StationaryOptions
 from zfusion.methods.stationary.substitution import NodeGains, Substitution, There
 from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -40,9 +44,6 @@ SETTLED = 1e-13
 """Change of the covariance in one step, relative to its largest entry, that counts as none."""
 
 
-DEFAULT = StationaryOptions()
-
-
 class Stationary:
     """One node's estimator. What it reports as P is what the design predicts when every message has always arrived.
 
@@ -54,19 +55,10 @@ class Stationary:
     name: ClassVar[str] = METHOD
     stages: ClassVar[tuple[Stage, ...]] = (ESTIMATOR,)
 
-    @staticmethod
-    def network(graph: Network) -> Network:
-        """The scenario's graph."""
-        return graph
-
-    def __init__(self, setting: Setting, options: StationaryOptions = DEFAULT, design: Design | None = None) -> None:
-        """`design` must be the same at all nodes, to the last bit; without it, the node makes one.
-
-        DesignError where there is none for this system.
-        """
-        system = setting.system
-        if design is None:
-            design = options.design(system, setting.network)
+    def __init__(self, setting: Setting) -> None:
+        """The setting's design must be the same at all nodes, to the last bit."""
+        system, design = setting.system, cast(Design, setting.design)
+        options = cast(StationaryOptions, setting.options)
         self._design, self._plant = design, design.problem.nominal
         self._position = {j: n for n, j in enumerate(design.ids)}
         self._neighbourhood = setting.network.neighbours(setting.node)
@@ -148,3 +140,29 @@ class _Transient:
         following = 0.5 * (moved + moved.T) + self._noise
         self._settled = bool(np.abs(following - self._P).max() <= SETTLED * np.abs(following).max())
         self._P, self._joint, self._errors = following, None, {}
+
+
+class _Designer:
+    """See `Designer`; the topology does not matter: what does not come is made up for."""
+
+    @staticmethod
+    def make(options: StationaryOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
+        return options.design(system, network)
+
+    @staticmethod
+    def load(path: Path, options: StationaryOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
+        return Design.load(path, options.fingerprint(system, network))
+
+
+def _check(options: StationaryOptions, system: System, network: Network) -> None:
+    problem_of(system, network, exchange_measurements=options.exchange_measurements)
+
+
+STATIONARY = Family(
+    Stationary.name,
+    Stationary,
+    stages=lambda _: Stationary.stages,
+    options=StationaryOptions,
+    designer=_Designer(),
+    check=_check,
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from zfusion.methods.stationary.design import Design, make_design
+from zfusion.methods.stationary.design import Design, fingerprint, make_design
 from zfusion.methods.stationary.lmi import Choice, Gramian
 from zfusion.methods.stationary.mapping import problem_of
 from zfusion.model.checks import ModelError
@@ -47,6 +47,11 @@ class StationaryOptions:
     def choice(self) -> Choice:
         """Of the convex design; InputError for what does not go together."""
         return Choice(Gramian(self.gramian), self.plain, self.worst_node, self.observer)
+
+    def fingerprint(self, system: System, network: Network) -> str:
+        """Of what is designed for; InputError as `problem_of`."""
+        problem = problem_of(system, network, exchange_measurements=self.exchange_measurements)
+        return fingerprint(system.ids, problem)
 
     def design(self, system: System, network: Network) -> Design:
         """Design the network: seconds to minutes. DesignError and InputError as `problem_of` and `make_design`."""

@@ -29,8 +29,12 @@ ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 class MethodSpec(Spec):
     """The method of estimation and what it takes; which methods there are is the methods' business."""
 
+    PATHS = ("design",)
+
     name: str = "two_stage"
     options: Options = Field(default_factory=dict)
+    design: str | None = None
+    """A file that `zfusion design -o` wrote, for methods that are designed off-line; else it is made at the start."""
 
 
 def _method(value: object) -> object:
@@ -86,7 +90,7 @@ class TimingSpec(Spec):
 
     @property
     def fractions(self) -> Mapping[str, float]:
-        """Deadline of each stage as a fraction of the period."""
+        """Deadlines as fractions of the period: those that are given, and those of the two stages that most have."""
         return {**DEFAULT_DEADLINES, **self.deadlines}
 
     @property
@@ -123,15 +127,6 @@ class TimingSpec(Spec):
             "late": self.late,
             "window": self.revised_steps,
         }
-
-    def deadline_ns(self, stage: str) -> int:
-        """How long after a step's beginning a paced node stops waiting for messages of `stage`.
-
-        KeyError for a stage that has no deadline, ValueError in free-running mode.
-        """
-        if self.period_ns is None:
-            raise ValueError("a free-running step has no deadlines, only timeouts")
-        return round(self.fractions[stage] * self.period_ns)
 
 
 class SourceSpec(Spec):

@@ -13,7 +13,7 @@ from zfusion import keys
 from zfusion.drivers.simulated import Simulation
 from zfusion.errors import MessageError, RunError, ZfusionError
 from zfusion.messages import Decoder
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording import Recording
@@ -94,7 +94,7 @@ def _launched(scenario: Scenario, task: Task, observer: Observer, recordings: st
 def _recorded(recording: Recording, scenario: Scenario) -> Iterator[tuple[Message, int]]:
     """All legal messages of the nodes, in order, and how large they are."""
     system, run = scenario.system(), recording.metadata["run"]
-    stages = {stage.name: stage for stage in (*BUILT_IN, *METHODS[scenario.method.name].stages)}
+    stages = {stage.name: stage for stage in (*BUILT_IN, *chosen(scenario).stages)}
     decoders: dict[str, Decoder] = {}
     for topic in recording.topics:
         try:
@@ -103,7 +103,7 @@ def _recorded(recording: Recording, scenario: Scenario) -> Iterator[tuple[Messag
             continue
         if found == run and name is not None and stage in stages:
             node: NodeId = scenario.node_id(name)
-            sizes: Mapping[str, int] = {"nx": system.nx, "ny": system.by_id[node].ny}
+            sizes: Mapping[str, int] = system.sizes(node)
             decoders[topic] = Decoder(stages[stage], node, sizes=sizes, ids=scenario.ids)
     for topic, data, *_ in recording.records(decoders):
         try:

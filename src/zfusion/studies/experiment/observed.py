@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zfusion.messages import encode
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
@@ -38,7 +38,7 @@ class Observer:
     """Takes in the messages of a run, each as it was published."""
 
     def __init__(self, scenario: Scenario) -> None:
-        method = METHODS[scenario.method.name]
+        method = chosen(scenario)
         self.scenario = scenario
         self.graph = method.network(scenario.network)
         """The method's."""

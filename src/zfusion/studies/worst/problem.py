@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from zfusion.errors import InputError
-from zfusion.methods import METHODS
+from zfusion.methods import chosen
 from zfusion.methods.ensemble import Arcs, Ensemble, Known, copies_at_once
 from zfusion.methods.layout import Bools, Ints
 from zfusion.methods.neighbourhood import StepModels
@@ -73,7 +73,7 @@ class Problem:
         self.network, self.system = method_network(scenario), scenario.system()
         self.arcs = Arcs(self.network.neighbourhoods)
         self.fate = fate_of(scenario)
-        self.stages = [stage.name for stage in METHODS[scenario.method.name].stages]
+        self.stages = [stage.name for stage in chosen(scenario).stages]
         steps, width = self.fate.used.shape
         parts = [self.fate.used, self.fate.told][: len(self.stages)]
         self.arriving: Bools = np.concatenate([(part & ~self.arcs.own).reshape(-1) for part in parts])

@@ -19,6 +19,8 @@ import tomli_w
 from zfusion.drivers.simulated import Simulation
 from zfusion.drivers.sources import Source, open_sources
 from zfusion.errors import InputError
+from zfusion.methods import chosen
+from zfusion.methods.check import deadline_ns
 from zfusion.model.scenario import ITEMS_ON_LINES, Scenario
 from zfusion.model.schema.run import NANOSECONDS
 from zfusion.model.types import Array, NodeId
@@ -179,7 +181,7 @@ def _check_delay(scenario: Scenario, delay_s: float) -> None:
         raise InputError(
             'delay: expected steps that have times, and timing.late = "drop": else nothing is late for good'
         )
-    longest_s = max(timing.deadline_ns(stage) for stage in timing.fractions) / NANOSECONDS
+    longest_s = max(deadline_ns(scenario, stage.name) for stage in chosen(scenario).stages) / NANOSECONDS
     if not delay_s > longest_s:
         raise InputError(f"delay: expected more than the last deadline, {longest_s:g} s (is {delay_s:g})")
 
