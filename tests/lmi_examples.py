@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from zfusion.drivers.designs import design_of
 from zfusion.methods import l2_linf, stationary
-from zfusion.methods.l2_linf.lmi import Designed, diagonal_design, slack_design
+from zfusion.methods.l2_linf.lmi import Designed, slack_design
 from zfusion.methods.protocol import Fields, Method, Outcome
-from zfusion.methods.stationary.lmi import Choice
 from zfusion.model.matrices import Fixed, RandomMatrix, Schedule
 from zfusion.model.noise import CovarianceNoise
+from zfusion.model.scenario import Scenario
 from zfusion.model.system import Sensor, System
 from zfusion.model.types import Array
 from zfusion.used_sets import Ledger
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
 IDS = (1, 2, 3, 4)
+
+
+def example(name: str, **changes: Any) -> Scenario:
+    """The scenario of that name among the examples, with some of its tables replaced."""
+    return Scenario.model_validate(tomllib.loads((EXAMPLES / f"{name}.toml").read_text()) | changes)
+
 
 GRAPHS: Mapping[str, Array] = {
     "PATH": np.eye(4) + np.eye(4, k=1) + np.eye(4, k=-1),
@@ -46,10 +57,16 @@ def polytope(points: int = 2) -> list[stationary.Plant]:
 
 
 @cache
-def designed(graph: str, choice: Choice | None = None, refine: bool = False) -> stationary.Design:
-    """A design of the nominal example, made once."""
-    problem = stationary.Problem.of(plant(), GRAPHS[graph])
-    return stationary.make_design(IDS, problem, choice, refine=refine)
+def designed(graph: str, choice: stationary.Choice | None = None) -> stationary.Design:
+    """A design of the nominal example, on any of the graphs, as the scenario's options describe it; made once."""
+    asked = stationary.Choice() if choice is None else choice
+    options: dict[str, Any] = {"gramian": asked.gramian.value}
+    options |= {name: getattr(asked, name) for name in ("plain", "worst_node", "observer")}
+    method = {"name": "stationary", "options": options}
+    scenario = example("stationary", network={"matrix": GRAPHS[graph].tolist()}, method=method)
+    design = design_of(scenario)
+    assert isinstance(design, stationary.Design)
+    return design
 
 
 def switching(
@@ -72,18 +89,35 @@ def switching(
 SURE = (1.0, 1.0, 1.0, 1.0)
 MISSING = (0.8, 0.7, 0.9, 0.6)
 
-DESIGNS: Mapping[str, Callable[[l2_linf.Problem], Designed]] = {
-    "general": diagonal_design,
-    "observer": lambda problem: diagonal_design(problem, l2_linf.Form.OBSERVER),
-    "slack 0": lambda problem: slack_design(problem, 0.0),
-    "slack -0.1": lambda problem: slack_design(problem, -0.1),
-}
+
+def switching_scenario(arrival: tuple[float, ...], **options: Any) -> Scenario:
+    """The switching example, with other probabilities that the sensors measure anything, and options of the method."""
+    method = {"name": "l2_linf", "options": {"output": [[1.0, 0.0]], **options}}
+    return example("l2_linf", method=method, sensors=switching_sensors(arrival))
+
+
+def switching_sensors(arrival: tuple[float, ...]) -> list[dict[str, Any]]:
+    """The sensors of the switching example with other probabilities that they measure anything; 1: nothing random."""
+    sensors = tomllib.loads((EXAMPLES / "l2_linf.toml").read_text())["sensors"]
+    for sensor, chance in zip(sensors, arrival, strict=True):
+        sensor["H"]["variables"]["theta"]["p"] = chance
+        if chance == 1:
+            sensor["H"] = sensor["H"]["terms"][0]["matrix"]
+    return list(sensors)
 
 
 @cache
-def filters(arrival: tuple[float, ...], name: str) -> Designed:
-    """A design of the switching example, made once."""
-    return DESIGNS[name](switching(arrival))
+def filters(arrival: tuple[float, ...], form: str) -> l2_linf.Design:
+    """A design of the switching example, as the scenario's options describe it; made once."""
+    design = design_of(switching_scenario(arrival, form=form))
+    assert isinstance(design, l2_linf.Design)
+    return design
+
+
+@cache
+def slack_filters(arrival: tuple[float, ...], tau: float) -> Designed:
+    """A design with a full Lyapunov function, made once."""
+    return slack_design(switching(arrival), tau)
 
 
 def system(

@@ -108,7 +108,7 @@ def test_errors_in_the_frequency_domain(spectrum: Spectrum, observed: Observed) 
     N = len(observed.Q)
     vectors = spectrum.vectors[:, 1:]
     inverse = N * observed.pooled
-    points, total = 4096, np.zeros((N, 2, 2))
+    points, total = 512, np.zeros((N, 2, 2))
     for omega in 2 * np.pi * (np.arange(points) + 0.5) / points:
         z = np.exp(1j * omega)
         shared = (vectors * mode_response(mixing, omega)) @ vectors.T

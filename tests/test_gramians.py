@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov, solve_sylvester
 
 from zfusion.errors import RunError
-from zfusion.methods.gramians import lyapunov, predictor_covariance, riccati_step, spectral_radius
+from zfusion.methods.gramians import (
+    lyapunov,
+    predictor_by_doubling,
+    predictor_covariance,
+    riccati_step,
+    spectral_radius,
+    sylvester,
+)
 from zfusion.model.types import Array
 
 
@@ -53,3 +60,31 @@ def test_predictor_is_where_the_recursion_ends() -> None:
     for _ in range(200):
         S = riccati_step(A, C, np.eye(2), np.eye(1), S)
     np.testing.assert_allclose(predictor_covariance(A, C, np.eye(2), np.eye(1)), S, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sylvester_is_scipys_for_many_at_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B, C = stable(rng, 5, 0.98), stable(rng, 3, 0.9), rng.standard_normal((4, 5, 3))
+    found = sylvester(A, B, C)
+    for one, constant in zip(found, C, strict=True):
+        expected = solve_sylvester(np.linalg.inv(A), -B.T, np.linalg.inv(A) @ constant)
+        np.testing.assert_allclose(one, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
+    with pytest.raises(RunError, match=r"spectral radii 1\.1 and 1"):
+        sylvester(1.1 * np.eye(2), np.eye(2), np.eye(2))
+
+
+@pytest.mark.parametrize("radius", [0.9, 1.0, 1.5])
+def test_predictor_by_doubling_is_scipys_for_any_state(radius: float) -> None:
+    rng = np.random.default_rng(5)
+    A, C, root = stable(rng, 4, radius), rng.standard_normal((2, 4)), rng.standard_normal((4, 4))
+    Q, R = root @ root.T, np.array([[1.0, 0.2], [0.2, 0.5]])
+    expected = solve_discrete_are(A.T, C.T, Q, R)
+    np.testing.assert_allclose(predictor_by_doubling(A, C, Q, R), expected, rtol=1e-8)
+    if radius < 1:
+        np.testing.assert_allclose(predictor_covariance(A, C, Q, R), expected, rtol=1e-8)
+
+
+def test_what_grows_unmeasured_has_no_predictor() -> None:
+    with pytest.raises(RunError, match="a part of the state grows and is not measured"):
+        predictor_by_doubling(np.diag([1.2, 0.5]), np.array([[0.0, 1.0]]), np.eye(2), np.eye(1))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.lmi_examples import GRAPHS, IDS, designed, plant, polytope
 
+from lmi_examples import GRAPHS, IDS, designed, plant, polytope
 from zfusion.errors import InputError
 from zfusion.methods import convex
 from zfusion.methods.convex import DesignError
-from zfusion.methods.stationary import Choice, Gramian, Plant, Problem, make_design
+from zfusion.methods.stationary import Choice, Design, Gramian, Plant, Problem, make_design
+from zfusion.methods.stationary import refine as refine_module
 from zfusion.methods.stationary.cost import Gains, best_output, evaluate, extended, gradients, masked, rescaled
 from zfusion.methods.stationary.doubt import Doubted
 from zfusion.methods.stationary.limits import (
@@ -22,7 +25,6 @@ from zfusion.methods.stationary.limits import (
     own_sensor_mse,
 )
 from zfusion.methods.stationary.losses import under_loss
-from zfusion.methods.stationary.refine import refine
 from zfusion.model.checks import ModelError
 from zfusion.model.types import Array
 
@@ -49,13 +51,22 @@ def test_baselines_of_the_reference_example() -> None:
         np.testing.assert_allclose(information_limit(Problem.of(plant(), GRAPHS[graph])), expected, atol=1e-5)
 
 
+@cache
+def refined(graph: str) -> Design:
+    """What a few hundred steps of descent make of the convex design: where thousands lead to, in four digits."""
+    design = designed(graph)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refine_module, "OPTIONS", refine_module.OPTIONS | {"maxiter": 300})
+        gains = refine_module.refine(design.problem, design.gains).gains
+    cost = evaluate(design.problem, gains)
+    return replace(design, gains=gains, J=cost.J, mse=cost.mse)
+
+
 @pytest.mark.parametrize("graph", TABLE)
-def test_reference_table(graph: str) -> None:
-    local, limit, O_bound, O_true, C_bound, C_true, refined = TABLE[graph]
-    o, c, r = designed(graph), designed(graph, CONTROLLABILITY), designed(graph, refine=True)
-    found = [o.neighbourhood_mse.sum(), o.information_limit.sum(), o.bound, o.J, c.bound, c.J, r.J]
-    expected = [local, limit, O_bound, O_true, C_bound, C_true, refined]
-    np.testing.assert_allclose(np.array(found, dtype=float), expected, atol=DIGITS)
+def test_reference_table_from_the_scenario(graph: str) -> None:
+    o, c = designed(graph), designed(graph, CONTROLLABILITY)
+    found = [o.neighbourhood_mse.sum(), o.information_limit.sum(), o.bound, o.J, c.bound, c.J, refined(graph).J]
+    np.testing.assert_allclose(np.array(found, dtype=float), TABLE[graph], atol=DIGITS)
 
 
 def test_per_node_errors_and_bounds() -> None:
@@ -72,23 +83,14 @@ def test_per_node_errors_and_bounds() -> None:
         assert (design.mse <= design.node_bounds).all()
 
 
-@pytest.mark.parametrize(
-    ("graph", "choice", "bound"),
-    [
-        ("PATH", Choice(plain=True), 3.4955),
-        ("PATH", Choice(Gramian.CONTROLLABILITY, plain=True), 4.1110),
-        ("RING", Choice(plain=True), 3.6535),
-        ("RING", Choice(Gramian.CONTROLLABILITY, plain=True), 4.8368),
-    ],
-)
-def test_plain_designs_of_the_reference(graph: str, choice: Choice, bound: float) -> None:
-    assert designed(graph, choice).bound == pytest.approx(bound, abs=DIGITS)
+def test_plain_design_of_the_reference() -> None:
+    plain = designed("RING", Choice(Gramian.CONTROLLABILITY, plain=True))
+    assert plain.bound == pytest.approx(4.8368, abs=DIGITS)
 
 
-@pytest.mark.parametrize(("graph", "cost"), [("PATH", 3.7420), ("RING", 3.9733)])
-def test_observer_type_of_the_reference(graph: str, cost: float) -> None:
-    design = designed(graph, Choice(observer=True))
-    assert pytest.approx(cost, abs=DIGITS) == design.J
+def test_observer_type_of_the_reference() -> None:
+    design = designed("RING", Choice(observer=True))
+    assert pytest.approx(3.9733, abs=DIGITS) == design.J
     problem = design.problem
     F, G, H = design.gains
     np.testing.assert_array_equal(H, -np.eye(12))
@@ -109,7 +111,7 @@ def random_problem(seed: int) -> Problem:
     return Problem.of(one, graph, weights=rng.uniform(0.5, 2, n))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_holds_for_every_design(seed: int) -> None:
     problem = random_problem(seed)
     local = float(problem.weights @ neighbourhood_mse(problem.nominal, problem.G))
@@ -128,15 +130,6 @@ def test_what_holds_for_every_design(seed: int) -> None:
     assert o.J <= o.bound <= local * (1 + 1e-5)
     assert c.bound >= c.J
     assert (c.mse <= c.node_bounds).all()
-
-
-def test_exchange_of_measurements_can_be_left_out() -> None:
-    problem = Problem.of(plant(), GRAPHS["RING"], exchange_measurements=False)
-    design = make_design(IDS, problem)
-    np.testing.assert_array_equal(design.gains.G, masked(problem, design.gains).G)
-    assert design.edge(1, 4)[1].tolist() == [[0.0], [0.0], [0.0]]
-    assert information_limit(problem).sum() > designed("RING").information_limit.sum()
-    assert information_limit(problem).sum() <= design.J < own_sensor_mse(plant()).sum()
 
 
 def test_cost_is_what_a_simulation_finds() -> None:
@@ -195,9 +188,11 @@ def test_no_doubt_is_the_true_cost_and_too_much_has_none() -> None:
     assert found[0] == pytest.approx(evaluate(problem, Gains(F, G, best_output(problem, P))).J, rel=1e-9)
     assert Doubted(problem, 100.0).cost(F, G) is None
     with pytest.raises(DesignError, match="not stable"):
-        refine(problem, designed("RING").gains, 100.0)
+        refine_module.refine(problem, designed("RING").gains, 100.0)
     with pytest.raises(InputError, match="for one plant"):
-        refine(Problem.of([small_plant(), small_plant(0.5)], np.ones((2, 2))), designed("RING").gains, 0.1)
+        refine_module.refine(
+            Problem.of([small_plant(), small_plant(0.5)], np.ones((2, 2))), designed("RING").gains, 0.1
+        )
 
 
 def test_doubt_is_a_simulated_factor() -> None:
@@ -251,7 +246,7 @@ def test_coordinates_change_nothing_that_can_be_seen() -> None:
 def test_descent_without_convex_design_comes_near_the_limit_and_bears_losses(graph: str) -> None:
     problem = Problem.of(plant(), GRAPHS[graph])
     design = make_design(IDS, problem, convex=False)
-    for loss in (0.05, 0.1, 0.3):
+    for loss in (0.1, 0.3):
         assert under_loss(design, loss).mse.sum() < 1.08 * under_loss(designed(graph), loss).mse.sum()
     assert design.bound is None
     assert design.iterations > 0
@@ -272,77 +267,67 @@ def test_larger_networks_take_the_route_without_convex_design(monkeypatch: pytes
     assert design.information_limit.sum() <= design.J < design.neighbourhood_mse.sum()
 
 
-LOSSES = (0.0, 0.1, 0.3, 0.5, 0.9)
+LOSSES = (0.0, 0.1, 0.5, 0.9)
 
 
 @pytest.mark.parametrize("graph", ["PATH", "RING"])
 def test_convex_designs_bear_losses_better_than_refined_ones(graph: str) -> None:
     """The descent gains less than 1 % where nothing is lost, and pays for it where something is, by 2 to 200 %."""
-    convex_design, refined = designed(graph), designed(graph, refine=True)
-    costs = [under_loss(convex_design, loss).mse.sum() for loss in LOSSES]
-    assert costs[0] == pytest.approx(convex_design.J, rel=1e-9)
+    costs = [under_loss(designed(graph), loss).mse.sum() for loss in LOSSES]
+    assert costs[0] == pytest.approx(designed(graph).J, rel=1e-9)
     assert costs == sorted(costs)
     assert costs[-1] < own_sensor_mse(plant()).sum()
-    assert under_loss(refined, 0.0).mse.sum() < costs[0]
-    assert under_loss(refined, 0.1).mse.sum() > 1.02 * costs[1]
+    assert under_loss(refined(graph), 0.0).mse.sum() < costs[0]
+    assert under_loss(refined(graph), 0.1).mse.sum() > 1.02 * costs[1]
 
 
 def worst(problem: Problem, gains: Gains) -> float:
     return max(evaluate(problem, gains, one).J for one in polytope(9))
 
 
-# (O) bound, worst; (C) bound, worst; plain (O) bound, worst; refined worst; local KF nominal, nominal (O), limit
-ROBUST = {
-    "PATH": (4.2380, 4.1323, 5.0126, 4.3072, 4.5963, 4.2012, 3.9215, 5.8627, 4.5919, 3.8819),
-    "RING": (4.4403, 4.3078, 5.9589, 4.7782, 4.8446, 4.4139, 4.0787, 6.8158, 4.7961, 4.0473),
-}
-
-
-def check_robust(graph: str, choice: Choice, bound: float, cost: float) -> Gains:
-    problem = Problem.of(polytope(), GRAPHS[graph])
-    design = make_design(IDS, problem, choice)
-    assert design.bound == pytest.approx(bound, abs=DIGITS)
-    assert worst(problem, design.gains) == pytest.approx(cost, abs=DIGITS)
-    assert worst(problem, design.gains) <= design.bound
-    return design.gains
+# local KF nominal, nominal (O)
+NOMINAL = {"PATH": (5.8627, 4.5919), "RING": (6.8158, 4.7961)}
 
 
 @pytest.mark.slow
-def test_robust_design_of_the_path_and_its_descent() -> None:
-    numbers = ROBUST["PATH"]
-    gains = check_robust("PATH", Choice(), *numbers[:2])
+def test_robust_designs_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(O) and the descent from it on the path; a hundred steps of descent are past the reference's."""
     problem = Problem.of(polytope(), GRAPHS["PATH"])
-    refined = refine(problem, gains)
-    limit = max(information_limit(problem, one).sum() for one in polytope(9))
-    assert limit == pytest.approx(numbers[9], abs=DIGITS)
-    assert limit < worst(problem, refined.gains) <= numbers[6] + DIGITS
+    robust = make_design(IDS, problem)
+    assert robust.bound == pytest.approx(4.2380, abs=DIGITS)
+    assert worst(problem, robust.gains) == pytest.approx(4.1323, abs=DIGITS)
+    monkeypatch.setattr(refine_module, "OPTIONS", refine_module.OPTIONS | {"maxiter": 100})
+    descended = refine_module.refine(problem, robust.gains)
+    limit = max(information_limit(problem, one).sum() for one in polytope(3))
+    assert limit == pytest.approx(3.8819, abs=DIGITS)
+    assert limit < worst(problem, descended.gains) <= 3.9215 + DIGITS
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("choice", "at"), [(CONTROLLABILITY, 2), (Choice(plain=True), 4)])
-def test_other_robust_designs_of_the_reference(choice: Choice, at: int) -> None:
-    check_robust("PATH", choice, *ROBUST["PATH"][at : at + 2])
+@pytest.mark.parametrize("choice", [Choice(), CONTROLLABILITY, Choice(plain=True)])
+def test_a_robust_bound_holds_between_the_vertices_too(choice: Choice) -> None:
+    problem = Problem.of([small_plant(0.5), small_plant(0.8)], np.ones((2, 2)))
+    design = make_design((1, 2), problem, choice)
+    costs = [evaluate(problem, design.gains, small_plant(a)) for a in np.linspace(0.5, 0.8, 7)]
+    assert design.bound is not None
+    assert max(cost.J for cost in costs) <= design.bound
+    if design.node_bounds is not None:
+        assert all((cost.mse <= design.node_bounds).all() for cost in costs)
 
 
-@pytest.mark.slow
-def test_robust_design_of_the_ring() -> None:
-    check_robust("RING", Choice(), *ROBUST["RING"][:2])
-
-
-@pytest.mark.parametrize("graph", ROBUST)
+@pytest.mark.parametrize("graph", NOMINAL)
 def test_what_nominal_designs_do_on_the_polytope(graph: str) -> None:
     problem = Problem.of(plant(), GRAPHS[graph])
-    assert worst(problem, local_predictors(problem)) == pytest.approx(ROBUST[graph][7], abs=DIGITS)
-    assert worst(problem, designed(graph).gains) == pytest.approx(ROBUST[graph][8], abs=DIGITS)
+    assert worst(problem, local_predictors(problem)) == pytest.approx(NOMINAL[graph][0], abs=DIGITS)
+    assert worst(problem, designed(graph).gains) == pytest.approx(NOMINAL[graph][1], abs=DIGITS)
 
 
 def test_a_descent_on_a_polytope_has_no_certificate() -> None:
     corners = [small_plant(0.5), small_plant(0.7)]
     problem = Problem.of(corners, np.ones((2, 2)))
-    certified, refined = (make_design((1, 2), problem, refine=r) for r in (False, True))
+    certified, descended = (make_design((1, 2), problem, refine=r) for r in (False, True))
     assert certified.bound is not None
-    assert refined.bound is None
-    assert refined.J < certified.J
+    assert descended.bound is None
+    assert descended.J < certified.J
 
 
 def small_plant(a: float = 0.8) -> Plant:

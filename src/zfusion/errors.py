@@ -3,6 +3,8 @@
     ZfusionError
     ├── InputError           what the user gave is wrong; nothing was started            (exit code 2)
     │   ├── ModelError       a number of the model that cannot be (`model.checks`)
+    │   ├── DesignError      a method that cannot be designed for what it was given (`methods.convex`)
+    │   ├── DesignFileError  a design file that is missing, damaged, or of something else (`methods.design_files`)
     │   ├── ScenarioError    a scenario file or object: names file, field, value, expectation
     │   └── RecordingError   a recording that is missing, damaged or of another version
     ├── RunError             what was started failed                                     (exit code 1)

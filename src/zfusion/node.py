@@ -28,7 +28,7 @@ from itertools import pairwise
 from typing import cast
 
 from zfusion.gaps import GapCounter
-from zfusion.methods.protocol import Fields, Method, Outcome, Revising
+from zfusion.methods.protocol import Fields, Method, Outcome, Revising, Wary
 from zfusion.model.types import Array, NodeId, sorted_ids
 from zfusion.stages import ESTIMATE, EVENT, REVISED, Message
 from zfusion.used_sets import HISTORY_RUNS, Ledger, Run, UsedSet
@@ -94,7 +94,7 @@ class EdgeCounters:
     missed: Counter[str] = field(default_factory=Counter)
     """By stage: not there at the deadline although expected."""
     refused: Counter[str] = field(default_factory=Counter)
-    """By reason: duplicate, too_early, former_life, unannounced_life."""
+    """By reason: duplicate, too_early, former_life, unannounced_life; and those of the method (`Wary`)."""
     gaps: defaultdict[str, GapCounter] = field(default_factory=lambda: defaultdict(GapCounter))
     """By stage: the account of the sender's own counter, which tells what was lost on the way."""
 
@@ -132,7 +132,10 @@ class Node:
         self.strays = 0
         """Messages from no neighbour, or of no stage of the method."""
         self.taken = 0
-        """Messages that were taken in, in time or late: all that were neither strays nor refused."""
+        """Messages that were taken in, in time or late: all that were neither strays nor refused, but for those that
+        the method itself refuses."""
+        self.incidents: Counter[str] = Counter()
+        """What was out of the ordinary with the method, by name."""
         self.completed = 0
         self.ledger = Ledger(node, born, window)
         self.step = born - 1
@@ -141,6 +144,7 @@ class Node:
         self.estimate: Outcome | None = None
         """Of the last completed step."""
         self._method = method
+        self._wary = method if isinstance(method, Wary) else None
         self._stages = [stage.name for stage in method.stages]
         self._number = {name: number for number, name in enumerate(self._stages)}
         self._patience = patience
@@ -313,11 +317,15 @@ class Node:
             self._expected[j] = self.step + 1 if late else message.step
 
     def _accept(self, message: Message) -> None:
-        """Into the present stage."""
+        """Into the present stage, unless the method refuses it; then there is nothing more to wait for, either."""
         j = message.node
+        self._missing.discard(j)
+        refusal = self._wary.refuses(self._stage, message.fields) if self._wary else None
+        if refusal is not None:
+            self.counters[j].refused[refusal] += 1
+            return
         self._arrived[j] = message.fields
         self._heard[j] = message
-        self._missing.discard(j)
         self.counters[j].received[message.stage] += 1
 
     def _open(self, stage: int, fields: Fields, now: int, effects: list[Effect]) -> None:
@@ -470,6 +478,7 @@ class Node:
         self._missing = set()
         self.completed += 1
         self.fallbacks += len(outcome.excluded)
+        self.incidents.update(outcome.incidents)
         fields = {"x": outcome.x, "P": outcome.P, "used": outcome.used, "excluded": outcome.excluded}
         effects.append(self._message(ESTIMATE.name, fields, now))
         for j, first in outcome.ask.items():

@@ -30,7 +30,7 @@ Seed = Annotated[int | None, typer.Option(help="Seed of all that is random.", mi
 Rate = Annotated[float | None, typer.Option("--rate", help="Steps a second.", min=1e-6, show_default="the scenario's")]
 FreeRun = Annotated[bool, typer.Option("--free-run", help="Each step as soon as the one before is done.")]
 MethodName = Annotated[
-    str | None, typer.Option("--method", help="two_stage, local or centralized.", show_default="the scenario's")
+    str | None, typer.Option("--method", help="Method of estimation.", show_default="the scenario's")
 ]
 Links = Annotated[
     Path | None,

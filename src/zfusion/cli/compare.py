@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from zfusion.cli.common import Json, Links, Loss, Seed, Steps, err, finish, load, out
-from zfusion.cli.progress import progress
+from zfusion.cli.progress import progress, waiting
 from zfusion.errors import InputError
+from zfusion.model.scenario import load_scenario
 
 if TYPE_CHECKING:
     from zfusion.model.scenario import Overrides, Scenario
     from zfusion.model.types import NodeId
+    from zfusion.recording import Recording
     from zfusion.studies.compare import Comparison, Configuration, Metric
 
 MetricName = Annotated[
@@ -34,6 +37,13 @@ def compare(
         Settings, typer.Option("--a", help="key=value for A, as timing.late=drop; repeatable.")
     ] = None,
     b_settings: Annotated[Settings, typer.Option("--b", help="The same for B.")] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(help="Compare methods instead: names with commas, options after colons, as consensus:rounds=8."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="With --methods: directory for figures.")
+    ] = None,
     metric: MetricName = "mse",
     seeds: Annotated[int | None, typer.Option(help="Seeds.", min=2, show_default=str(SEEDS))] = None,
     seed: Seed = None,
@@ -42,10 +52,18 @@ def compare(
     loss: Loss = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two configurations on the same measurements: which is better, by how much, and how sure that is."""
+    """Compare two configurations, or methods, on the same measurements: which is better, by how much, how surely."""
     from zfusion.model.scenario import Overrides
     from zfusion.report.compare import show_comparisons
 
+    if methods is not None:
+        if b is not None or a_settings or b_settings or metric != "mse":
+            raise InputError("--methods compares methods on one scenario or recording: no B, --a, --b, --metric")
+        overrides = Overrides(steps=steps, seed=seed, links=links, loss=loss)
+        _methods(a, [label.strip() for label in methods.split(",")], overrides, seeds, output, as_json)
+        return
+    if output is not None:
+        raise InputError("--output goes with --methods")
     paths = (a, b or a)
     recorded = [path.suffix == ".mcap" for path in paths]
     if any(recorded):
@@ -61,6 +79,40 @@ def compare(
         ]
         comparisons = _simulations(chosen, seeds or SEEDS, metric)
     finish(comparisons[0].as_dict(), as_json, lambda: show_comparisons(out, comparisons))
+
+
+def _methods(
+    path: Path, labels: list[str], overrides: Overrides, seeds: int | None, output: Path | None, as_json: bool
+) -> None:
+    from zfusion.report.extras import check_extras
+    from zfusion.report.method_comparison import save_figures, show_methods
+    from zfusion.studies.method_comparison import compare_methods, field_of, field_of_recording
+
+    if output is not None:
+        check_extras()
+    with TemporaryDirectory(prefix="zfusion-") as designs:
+        if path.suffix == ".mcap":
+            if seeds is not None or any(overrides.get(name) is not None for name in ("steps", "seed")):
+                raise InputError("a recording has its own measurements: no --seeds, --seed, --steps")
+            with _opened(path) as recording, waiting("designing, where methods are designed"):
+                field = field_of_recording(recording, labels, Path(designs), overrides)
+            first, count = 0, 1
+        else:
+            loaded = load_scenario(path, **overrides)
+            with waiting("designing, where methods are designed"):
+                field = field_of(loaded, labels, Path(designs))
+            first, count = loaded.seed, seeds or SEEDS
+        with progress("seeds", count) as done:
+            compared = compare_methods(field, range(first, first + count), jobs=os.cpu_count() or 1, progress=done)
+    figures = [] if output is None else save_figures(compared, output)
+    told = {**compared.as_dict(), "figures": [str(figure) for figure in figures]}
+    finish(told, as_json, lambda: show_methods(out, compared, figures))
+
+
+def _opened(path: Path) -> Recording:
+    from zfusion.recording import Recording
+
+    return Recording.open(path)
 
 
 def _configuration(path: Path, option: str, settings: list[str], overrides: Overrides) -> Configuration:

@@ -37,6 +37,7 @@ from zfusion.cli.common import (
     recording_path,
     run_name,
 )
+from zfusion.cli.progress import design_first
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
 
@@ -94,6 +95,7 @@ def launched(
 
     directory = recording.parent if recording is not None else default_directory(scenario)
     logs = directory / f"{run}.logs"
+    design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
         options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
         launcher = Launcher(scenario, options)
@@ -136,6 +138,7 @@ def simulate(
     loaded = load(scenario, steps, rate, free_run, seed, method, links, loss)
     name = run_name(run, loaded)
     path = recording_path(loaded, name, record, no_record)
+    design_first(loaded)
     with err.status(f"simulating {loaded.steps} steps of {len(loaded.ids)} nodes"):
         reports = run_simulation(loaded, run=name, output=path)
     recorded = None

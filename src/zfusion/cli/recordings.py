@@ -26,6 +26,7 @@ from zfusion.cli.common import (
     on_signals,
     out,
 )
+from zfusion.cli.progress import design_first
 from zfusion.methods.check import check_method
 from zfusion.model.scenario import Overrides, Scenario
 
@@ -147,6 +148,7 @@ def _rerun(recording: Recording, other: Scenario, output: Path, run: str | None,
     from zfusion.report.replay import show_rerun
 
     output.parent.mkdir(parents=True, exist_ok=True)
+    design_first(other)
     with err.status("running the measurements again"):
         done = rerun(recording, other, output, run=run)
     finish({"recording": str(output), "nodes": done.as_dict()}, as_json, lambda: show_rerun(out, done, output))

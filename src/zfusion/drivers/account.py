@@ -10,6 +10,7 @@ from zfusion.drivers.meters import Meter
 from zfusion.drivers.metrics import Errors, Latencies, NodeReport, Pace, edge_report, told_estimate
 from zfusion.drivers.sources import Source
 from zfusion.links import Topology
+from zfusion.links.punctuality import arrival_probabilities
 from zfusion.methods import Setting, chosen
 from zfusion.methods.check import deadline_ns
 from zfusion.methods.protocol import Method
@@ -17,7 +18,10 @@ from zfusion.model.network import Network
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node, Patience
-from zfusion.stages import ARRIVALS, TRUTH, TRUTH_SENDER, Message
+from zfusion.stages import ARRIVALS, ESTIMATE, INTERMEDIATE, REVISED, TRUTH, TRUTH_SENDER, Message
+
+COMPARED = (INTERMEDIATE.name, ESTIMATE.name, REVISED.name)
+"""Stages whose x is an estimate of the state at their step."""
 
 MakeMethod = Callable[[Setting], Method]
 """What a node computes with, made anew for each of its lives."""
@@ -60,6 +64,7 @@ def setting_of(scenario: Scenario, graph: Network, node: NodeId, born: int) -> S
         scenario.timing.revised_steps,
         design=design_of(scenario),
         mode=Topology(scenario).mode,
+        punctuality=lambda most: arrival_probabilities(scenario, node, most),
     )
 
 
@@ -93,7 +98,9 @@ class Account:
         self._paces = [Pace(begun_ns)]
 
     def compare(self, message: Message) -> None:
-        """Set an estimate, of whatever stage, beside the truth, where that is known."""
+        """Set an estimate beside the truth, where that is known; what else a method calls x is none of the state."""
+        if message.stage not in COMPARED:
+            return
         truth = self._source.truth(message.step)
         if truth is None:
             return
@@ -139,6 +146,7 @@ class Account:
             estimate=told_estimate(node),
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},
             measured=self.meter.told(),
+            incidents=dict(node.incidents),
         )
 
     def last_words(self) -> dict[str, object]:

@@ -179,6 +179,8 @@ class NodeReport:
     """Messages that waited at the most: too far `ahead` of the node, `held` by emulated links."""
     emulated: dict[str, dict[str, int]] = field(default_factory=dict)
     """Neighbour -> what link emulation did with its messages here -> how often."""
+    incidents: dict[str, int] = field(default_factory=dict)
+    """What was out of the ordinary with the method -> how often."""
 
     @classmethod
     def of_nothing(cls, node: NodeId) -> NodeReport:

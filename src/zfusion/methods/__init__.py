@@ -6,6 +6,7 @@ import json
 from functools import lru_cache
 
 from zfusion.methods.consensus.method import CONSENSUS
+from zfusion.methods.delay_aware.filter import DELAY_AWARE
 from zfusion.methods.diffusion import DIFFUSION
 from zfusion.methods.family import Chosen, Family
 from zfusion.methods.hybrid import HYBRID
@@ -23,6 +24,7 @@ METHODS: dict[str, Family] = {
         *(TWO_STAGE, LOCAL, CENTRALIZED),
         *(CONSENSUS, STATIONARY, L2_LINF),
         *(DIFFUSION, KALMAN_CONSENSUS, HYBRID, INTERSECTION),
+        *(DELAY_AWARE,),
     )
 }
 """Every method by its name in a scenario."""

@@ -62,6 +62,10 @@ def _ability_problems(scenario: Scenario, method: Chosen) -> Iterator[Problem]:
     if scenario.timing.late == "revise" and not method.revises:
         able = ", ".join(family.name for family in METHODS.values() if family.revises)
         yield Problem("timing.late", "revise", f"expected a method that can go back: {able}")
+    lateness, window = method.family.lateness(method.options), scenario.timing.revised_steps
+    if lateness > window:
+        wanted = f'expected late = "revise" and a window of {lateness} at least: the method wants messages so late'
+        yield Problem("timing.window", window, wanted)
     if scenario.method.design is not None and method.family.designer is None:
         able = ", ".join(family.name for family in METHODS.values() if family.designer is not None)
         yield Problem("method.design", scenario.method.design, f"expected a method that is designed off-line: {able}")

@@ -16,8 +16,11 @@ from typing import ClassVar, cast
 import numpy as np
 
 from zfusion.methods.family import Family
+from zfusion.methods.packing import IMPOSSIBLE, too_large
 from zfusion.methods.protocol import Fields, Outcome, Setting
-from zfusion.methods.white import White, kalman_update
+from zfusion.methods.white import White, check_white, kalman_update
+from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -43,6 +46,10 @@ class Diffusion:
         self._model = White(setting.system, self._neighbourhood)
         self._x, self._P = self._model.before(setting.born)
 
+    def refuses(self, stage: int, fields: Fields) -> str | None:
+        """Numbers that are too large to be computed with."""
+        return IMPOSSIBLE if too_large(fields, "y" if stage == 0 else "x") else None
+
     def begin(self, step: int, y: Array | None) -> Fields:
         """The measurement, as it is."""
         self._x, self._P = self._model.predict(step, self._x, self._P)
@@ -67,4 +74,8 @@ class Diffusion:
         return Outcome(self._x, self._P, tuple(here))
 
 
-DIFFUSION = Family(Diffusion.name, Diffusion, stages=lambda _: Diffusion.stages)
+def _check(_: object, system: System, __: Network) -> None:
+    check_white(system)
+
+
+DIFFUSION = Family(Diffusion.name, Diffusion, stages=lambda _: Diffusion.stages, check=_check)

@@ -29,8 +29,26 @@ class Modes(NamedTuple):
     """Π, rows add up to 1, (modes, modes)."""
 
 
+class Forecast(NamedTuple):
+    """What is known of a method's errors before it runs; what nothing is known of is left out, or None.
+
+    Names are words joined by "_". Mean squared errors are stationary, with every message there.
+    """
+
+    network: Mapping[str, float | str | None]
+    """Of the network as a whole."""
+    nodes: Mapping[str, Sequence[float]]
+    """By what it is a number for every node, in the order of their ids."""
+    remarks: Sequence[str] = ()
+    """What a reader of the numbers must know, in sentences."""
+
+
 class Design(Protocol):
     """What a method computed off-line, for all nodes."""
+
+    @property
+    def forecast(self) -> Forecast:
+        """What it promises, what it really costs, and what both are to be set beside."""
 
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
@@ -50,6 +68,10 @@ def _as_it_is(graph: Network) -> Network:
     return graph
 
 
+def _none(_: object) -> int:
+    return 0
+
+
 @dataclass(frozen=True)
 class Family:
     """A method of estimation, whatever its options are."""
@@ -65,7 +87,11 @@ class Family:
     """The graph whose neighbourhoods the method uses, given the scenario's."""
     revises: bool = False
     """Whether it is `Revising`: it can take in what comes late."""
+    lateness: Callable[[Any], int] = _none
+    """By how many steps messages may be late that the method wants: it takes a window of as many."""
     designer: Designer | None = None
+    forecast: Callable[[Any, System, Network], Forecast] | None = None
+    """What is known before it runs, where it is not designed off-line; InputError where nothing is."""
     check: Callable[[Any, System, Network], None] | None = None
     """Refuses, with an InputError or ModelError, a system or a network that the method cannot stand."""
     note: str = ""

@@ -22,11 +22,12 @@ from typing import ClassVar, cast
 import numpy as np
 
 from zfusion.methods.family import Family
-from zfusion.methods.packing import packed, unpacked
+from zfusion.methods.packing import IMPOSSIBLE, is_definite, is_semidefinite, packed, too_large, unpacked
 from zfusion.methods.protocol import Fields, Outcome, Setting
-from zfusion.methods.white import White
+from zfusion.methods.white import White, check_white, inverse
 from zfusion.model.checks import ModelError
 from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger, UsedSet
@@ -87,12 +88,25 @@ class Hybrid:
         self._count = len(setting.network.ids)
         self._model = White(setting.system, self._neighbourhood)
         self._x, self._P = self._model.before(setting.born)
+        self._incidents: list[str] = []
+
+    def refuses(self, stage: int, fields: Fields) -> str | None:
+        """Information that is none: averages of priors are positive definite, those of measurements not negative."""
+        wrong = (
+            too_large(fields, "q", "omega", *(("y",) if stage == 0 else ("dq", "domega")))
+            or not is_definite(unpacked(cast(Array, fields["omega"])))
+            or (stage > 0 and not is_semidefinite(unpacked(cast(Array, fields["domega"]))))
+        )
+        return IMPOSSIBLE if wrong else None
 
     def begin(self, step: int, y: Array | None) -> Fields:
-        """The own measurement, and the information in the prediction."""
+        """The own measurement, and the information in the prediction; in that of the prior, where P is singular."""
         self.skip(step)
-        prior = np.linalg.inv(self._P)
-        prior = 0.5 * (prior + prior.T)
+        self._incidents = []
+        if not is_definite(self._P):
+            self._incidents.append("started_again")
+            self._x, self._P = self._model.before(step + 1)
+        prior = inverse(self._P)
         return {"y": y, "q": prior @ self._x, "omega": packed(prior)}
 
     def skip(self, step: int) -> None:
@@ -112,11 +126,13 @@ class Hybrid:
         }
         if stage + 1 < self._rounds:
             return {**mixed, "used": used}
-        information = unpacked(mixed["omega"] + self._count * mixed["domega"], len(mixed["q"]))
-        P = np.linalg.inv(information)
-        self._P = 0.5 * (P + P.T)
-        self._x = self._P @ (mixed["q"] + self._count * mixed["dq"])
-        return Outcome(self._x, self._P, used)
+        information = unpacked(mixed["omega"] + self._count * mixed["domega"])
+        if is_definite(information):
+            self._P = inverse(information)
+            self._x = self._P @ (mixed["q"] + self._count * mixed["dq"])
+        else:
+            self._incidents.append("without_update")
+        return Outcome(self._x, self._P, used, incidents=tuple(self._incidents))
 
     def _with_news(self, step: int, j: NodeId, fields: Fields) -> Fields:
         """A first message with the information in its measurement: none where there is no measurement."""
@@ -128,4 +144,8 @@ class Hybrid:
         return {**fields, "dq": dq, "domega": packed(weight)}
 
 
-HYBRID = Family(Hybrid.name, Hybrid, stages=stages, options=HybridOptions)
+def _check(_: object, system: System, __: Network) -> None:
+    check_white(system, invertible=True)
+
+
+HYBRID = Family(Hybrid.name, Hybrid, stages=stages, options=HybridOptions, check=_check)

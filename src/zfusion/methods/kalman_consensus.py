@@ -21,9 +21,12 @@ from typing import ClassVar, cast
 import numpy as np
 
 from zfusion.methods.family import Family
+from zfusion.methods.packing import IMPOSSIBLE, too_large
 from zfusion.methods.protocol import Fields, Outcome, Setting
-from zfusion.methods.white import White
+from zfusion.methods.white import White, absorb, check_white
 from zfusion.model.checks import ModelError
+from zfusion.model.network import Network
+from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 from zfusion.stages import MEASUREMENT, Field, Kind, Stage
 from zfusion.used_sets import Ledger
@@ -60,6 +63,10 @@ class KalmanConsensus:
         self._x, self._P = self._model.before(setting.born)
         self._epsilon = cast(KalmanConsensusOptions, setting.options).epsilon
 
+    def refuses(self, stage: int, fields: Fields) -> str | None:  # noqa: ARG002
+        """Numbers that are too large to be computed with."""
+        return IMPOSSIBLE if too_large(fields, "y", "x") else None
+
     def begin(self, step: int, y: Array | None) -> Fields:
         """The measurement and the prediction."""
         self.skip(step)
@@ -80,13 +87,21 @@ class KalmanConsensus:
             if y is not None:
                 told, weight = told + information[j].gain @ y, weight + information[j].weight
             pull = pull + (cast(Array, arrived[j]["x"]) - x)
-        M = np.linalg.solve(np.eye(len(x)) + P @ weight, P)
-        M = 0.5 * (M + M.T)
         leaning = self._epsilon / (1.0 + float(np.linalg.norm(P))) * (P @ pull)
-        self._x, self._P = x + M @ (told - weight @ x) + leaning, M
+        updated = absorb(x, P, told, weight)
+        assert updated is not None  # a sum of the model's own Hᵀ R^-1 H is no negative information
+        self._x, self._P = updated[0] + leaning, updated[1]
         return Outcome(self._x, self._P, here)
 
 
+def _check(_: object, system: System, __: Network) -> None:
+    check_white(system)
+
+
 KALMAN_CONSENSUS = Family(
-    KalmanConsensus.name, KalmanConsensus, stages=lambda _: KalmanConsensus.stages, options=KalmanConsensusOptions
+    KalmanConsensus.name,
+    KalmanConsensus,
+    stages=lambda _: KalmanConsensus.stages,
+    options=KalmanConsensusOptions,
+    check=_check,
 )

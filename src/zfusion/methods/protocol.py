@@ -7,10 +7,10 @@ arrived, publishes the next stage, and so on, until `advance` of the last stage 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from zfusion.model.network import Network
 from zfusion.model.system import System
@@ -40,6 +40,9 @@ class Setting:
     """What was computed off-line for all nodes, where the method has that: `Designing`."""
     mode: Callable[[int], int] = lambda _: 0
     """The mode of the topology at a step, the same at all nodes; 0 where it does not switch."""
+    punctuality: Callable[[int], Mapping[NodeId, Sequence[float]]] | None = None
+    """L -> of each neighbour the probabilities that what is received of it at a step is 0, ..., L steps old, as far as
+    the world knows its links; None where it does not."""
 
 
 class Outcome(NamedTuple):
@@ -52,9 +55,11 @@ class Outcome(NamedTuple):
     used: UsedSet
     """Whose messages of the last stage went into it."""
     excluded: UsedSet = ()
-    """Whose messages were there and had to be left out, because their history is not known (a *fallback*)."""
+    """Whose messages were there and had to be left out, mostly as their history is not known (a *fallback*)."""
     ask: Mapping[NodeId, int] = MappingProxyType({})
     """Whose history is wanted, and from which step on."""
+    incidents: tuple[str, ...] = ()
+    """What was out of the ordinary with the method itself, one word each time; counted, and told at the end."""
 
 
 class Method(Protocol):
@@ -72,6 +77,17 @@ class Method(Protocol):
 
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
         """Take in what arrived of a stage, the own message included; the next stage's fields, or the outcome."""
+
+
+@runtime_checkable
+class Wary(Protocol):
+    """A method that does not take in every message that is well-formed: not what no honest neighbour can say."""
+
+    def refuses(self, stage: int, fields: Fields) -> str | None:
+        """Why a neighbour's message is not taken in, in one word, under which it is counted; None where it is.
+
+        A function of its arguments only: so what was refused is so again in a replay, or is not there.
+        """
 
 
 class Revising(Method, Protocol):

@@ -15,6 +15,7 @@ import json
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self, TypedDict, TypeVar, Unpack
@@ -238,6 +239,7 @@ class Scenario(Spec):
         """SHA-256 in hex of all that defines the mathematics and the timing of a run, however it is written.
 
         Nodes of one run must agree in it. Names, endpoints, where files are kept and the number of steps do not matter.
+        A design file counts by its content, where it can be read.
         """
         sensors = {str(i): self._sensor_facts(i) for i in self.ids}
         facts = {
@@ -248,7 +250,7 @@ class Scenario(Spec):
             "noise": self.noise.model_dump(exclude_none=True),
             "network": [(i, self.network.neighbours(i)) for i in self.ids],
             "weights": sorted(self.network.weights.items()),
-            "method": self.method.with_paths(_file_name).model_dump(exclude_none=True),
+            "method": self._method_facts(),
             "timing": self.timing.facts,
             "links": self.links.with_paths(_file_name).facts,
             "faults": [fault.model_dump(exclude_none=True) for fault in self.faults],
@@ -256,6 +258,14 @@ class Scenario(Spec):
         }
         text = json.dumps(facts, sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def _method_facts(self) -> dict[str, Any]:
+        """Of a design what is in it, wherever it lies: what nodes tell each other means something within one only."""
+        facts = self.method.with_paths(_file_name).model_dump(exclude_none=True)
+        if self.method.design is not None:
+            with suppress(OSError):  # whoever reads it as a design says so
+                facts["design"] = hashlib.sha256(self.absolute(self.method.design).read_bytes()).hexdigest()
+        return facts
 
     def _sensor_facts(self, i: NodeId) -> dict[str, Any]:
         entry = self._entries[i]

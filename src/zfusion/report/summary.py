@@ -16,6 +16,7 @@ from rich.table import Table
 from zfusion.drivers.meters import add_up
 from zfusion.drivers.metrics import Latencies, NodeReport, RecorderReport
 from zfusion.links import Timeline
+from zfusion.methods import chosen
 from zfusion.methods.prediction import predict
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -73,11 +74,12 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    revised, too_late, stale (`EdgeCounters`),
+    revised, too_late, stale (`EdgeCounters`), refused and incidents by name,
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
     recording; the verdict on each edge, with its latencies and budget; rounds {node} (`latency.of_node`); what link
-    emulation did (emulated), what was planned to go wrong (faults), and what a network of namespaces did (network).
+    emulation did (emulated), what was planned to go wrong (faults), and what a network of namespaces did (network);
+    notes: what a user of the method must know of every run.
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
@@ -88,6 +90,7 @@ def summarize(
     return {
         "run": run,
         "method": scenario.method.name,
+        "notes": notes_of(scenario),
         "nodes": list(scenario.ids),
         "steps": scenario.steps,
         "completed_steps": {str(i): sum(r.completed for r in reports.get(i, ())) for i in scenario.ids},
@@ -98,6 +101,7 @@ def summarize(
         "missed": sum(edge.missed for edge in edges),
         "refused": _refused(lives),
         "fallbacks": sum(report.fallbacks for report in lives),
+        "incidents": _incidents(lives),
         "skipped": sum(report.skipped for report in lives),
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
@@ -124,6 +128,12 @@ def summarize(
         "logs": logs,
         "network": network,
     }
+
+
+def notes_of(scenario: Scenario) -> list[str]:
+    """What a user of the scenario's method must know of every run."""
+    note = chosen(scenario).family.note
+    return [note] if note else []
 
 
 def _edges(
@@ -167,6 +177,14 @@ def _lost_at_the_end(stage: str, lives: Sequence[NodeReport], senders_lives: Seq
     [receiver], [told] = lives, senders_lives
     unread = max(0, told.step - receiver.step)
     return max(0, told.sent.get(stage, 0) - receiver.edges[sender]["heard"].get(stage, 0) - unread)
+
+
+def _incidents(lives: Iterable[NodeReport]) -> dict[str, int]:
+    """What was out of the ordinary with the method, in all nodes together."""
+    total: Counter[str] = Counter()
+    for report in lives:
+        total.update(report.incidents)
+    return dict(total)
 
 
 def _refused(lives: Iterable[NodeReport]) -> dict[str, int]:
@@ -255,6 +273,8 @@ def show_summary(console: Console, summary: Mapping[str, Any]) -> None:
         told = ", ".join(f"{kind} {_number(sum(of) / len(of))}" for kind, of in bounds.items())
         console.print(f"predicted rmse without a network and with a centre, mean of the nodes: {told}")
     _show_traffic(console, summary)
+    for note in summary["notes"]:
+        console.print(f"note: {note}", soft_wrap=True)
     for failure in summary["failures"]:
         console.print(f"[bold red]failed:[/] {escape(failure)}", soft_wrap=True)
     if summary["recording"]:
@@ -270,7 +290,8 @@ def _table_of_errors(summary: Mapping[str, Any]) -> Table:
     for stage, of_nodes in summary["rmse"].items():
         heading = HEADINGS.get(stage, stage)
         columns[f"{heading}\nrmse"] = of_nodes
-        columns[f"{heading}\npredicted"] = design.get(DESIGNED[stage]) or summary["predicted_rmse"].get(stage, {})
+        beforehand = design.get(DESIGNED.get(stage, ""))
+        columns[f"{heading}\npredicted"] = beforehand or summary["predicted_rmse"].get(stage, {})
     if summary["nees"]:
         columns[f"{ESTIMATE.name}\nnees"] = summary["nees"]
     last = {} if summary["rmse"] else summary["estimates"]
@@ -298,6 +319,9 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
     console.print(", ".join(f"{count} {name}" for name, count in trouble.items()))
     if summary["refused"]:
         console.print("refused: " + ", ".join(f"{count} {reason}" for reason, count in summary["refused"].items()))
+    if summary["incidents"]:
+        told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["incidents"].items())
+        console.print(f"steps of the method's own: {told}")
     latency = summary["latency_us"]
     if summary["rounds_per_s"] and latency["p50"] is not None and not summary["simulated"]:
         console.print(

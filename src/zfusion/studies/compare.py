@@ -133,7 +133,7 @@ def compare(
         if progress is not None:
             progress(1)
     values = np.array(found)
-    return _comparisons([c.label for c in configurations], values, scenarios[0].ids, metric, "seed")
+    return paired_by_node([c.label for c in configurations], values, scenarios[0].ids, metric, "seed")
 
 
 def compare_recordings(recordings: Sequence[Recording], metric: Metric = "mse") -> list[Comparison]:
@@ -155,22 +155,25 @@ def compare_recordings(recordings: Sequence[Recording], metric: Metric = "mse") 
         if step <= steps:
             truth[step] = x
     series = [
-        _series(_recorded_estimates(recording, scenario), ids, truth, metric)
+        series_of(_recorded_estimates(recording, scenario), ids, truth, metric)
         for recording, scenario in zip(recordings, scenarios, strict=True)
     ]
-    common = _common(series)
+    common = common_steps(series)
     count = min(STRETCHES, len(common[0]) // SHORTEST)
     if count < 2 or np.isnan(common[0]).all():
         raise InputError(f"{recordings[0].path}: expected {2 * SHORTEST} steps or more with what {metric} needs")
     parts = [np.array_split(one, count) for one in common]
-    values = np.array([[_means(part[n]) for part in parts] for n in range(count)])
-    return _comparisons([str(recording.path) for recording in recordings], values, ids, metric, "stretch")
+    values = np.array([[means_over_steps(part[n]) for part in parts] for n in range(count)])
+    return paired_by_node([str(recording.path) for recording in recordings], values, ids, metric, "stretch")
 
 
-def _comparisons(
+def paired_by_node(
     labels: Sequence[str], values: Array, ids: Sequence[NodeId], metric: Metric, unit: str
 ) -> list[Comparison]:
-    """From (pairs, configurations, m)."""
+    """Each of the other configurations with the first one, from (pairs, configurations, m).
+
+    Nodes that have not a value everywhere do not count; InputError where there is no other.
+    """
     columns = {str(i): values[:, :, position] for position, i in enumerate(ids)}
     columns = {node: of for node, of in columns.items() if not np.isnan(of).any()}
     if not columns:
@@ -195,17 +198,17 @@ def _means_of_seed(scenarios: Sequence[Scenario], metric: Metric, seed: int) -> 
     if chosen[0].truth_known:
         path = SamplePath(chosen[0].system(), seed)
         truth = np.array([path.truth(k) for k in range(chosen[0].steps + 1)])
-    series = [_series(_simulated_estimates(scenario), scenario.ids, truth, metric) for scenario in chosen]
-    return np.array([_means(one) for one in _common(series)])
+    series = [series_of(_simulated_estimates(scenario), scenario.ids, truth, metric) for scenario in chosen]
+    return np.array([means_over_steps(one) for one in common_steps(series)])
 
 
-def _common(series: Sequence[Series]) -> list[Series]:
+def common_steps(series: Sequence[Series]) -> list[Series]:
     """NaN wherever one of them is."""
     there = ~np.isnan(np.array(series)).any(axis=0)
     return [np.where(there, one, np.nan) for one in series]
 
 
-def _means(series: Series) -> Array:
+def means_over_steps(series: Series) -> Array:
     """Over the steps at which there is a value, (m,); NaN where there is none."""
     there = ~np.isnan(series)
     total = np.where(there, series, 0.0).sum(axis=0)
@@ -242,7 +245,7 @@ def _recorded_estimates(recording: Recording, scenario: Scenario) -> Iterator[Me
             continue  # nobody in the swarm took it for one
 
 
-def _series(estimates: Iterator[Message], ids: Sequence[NodeId], truth: Array, metric: Metric) -> Series:
+def series_of(estimates: Iterator[Message], ids: Sequence[NodeId], truth: Array, metric: Metric) -> Series:
     """The metric of steps 1, 2, ...; truth (steps + 1, nx). Of two estimates of one step the later counts."""
     place = {i: position for position, i in enumerate(ids)}
     steps, nx = len(truth) - 1, truth.shape[1]
@@ -253,7 +256,7 @@ def _series(estimates: Iterator[Message], ids: Sequence[NodeId], truth: Array, m
             x[message.step - 1, place[message.node]] = message.fields["x"]
             P[message.step - 1, place[message.node]] = message.fields["P"]
     if metric == "disagreement":
-        mean = _means(x.swapaxes(0, 1))
+        mean = means_over_steps(x.swapaxes(0, 1))
         return np.asarray(((x - mean[:, None]) ** 2).sum(axis=-1))
     error = x - truth[1:, None]
     if metric == "mse":

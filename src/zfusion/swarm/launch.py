@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
 from zfusion.errors import InputError
@@ -48,6 +49,9 @@ between our finding it free and the node's listening on it."""
 
 _tried = count(os.getpid() * 61)
 """Two launchers begin at different places."""
+
+DESIGN = "design.npz"
+"""Among the logs: what all nodes share, where the method is designed off-line and the scenario names no file."""
 
 ZFUSION = (sys.executable, "-m", "zfusion")
 
@@ -123,8 +127,8 @@ class Launcher:
     """One launch of a swarm."""
 
     def __init__(self, scenario: Scenario, options: LaunchOptions) -> None:
-        """InputError where the logs cannot be written."""
-        self._scenario, self._options = scenario, options
+        """InputError where the logs cannot be written, or the method cannot be designed: it is here, for all nodes."""
+        self._options = options
         self._selector = selectors.DefaultSelector()
         self._failures: list[str] = []
         self._interrupts = 0
@@ -134,7 +138,8 @@ class Launcher:
         self._file = options.logs / "scenario.toml"
         try:
             options.logs.mkdir(parents=True, exist_ok=True)
-            self._file.write_text(scenario.anchored().to_toml())
+            self._scenario = with_design(scenario, options.logs / DESIGN)
+            self._file.write_text(self._scenario.anchored().to_toml())
         except OSError as error:
             raise InputError(f"{options.logs}: cannot be written: {error.strerror}") from None
         self._network = self._plan_network()

@@ -87,7 +87,7 @@ def _check(a: Array, names: list[object]) -> None:
             f"directed graph not supported: weight {names[j]}->{names[i]} is {a[i, j]:g}, "
             f"{names[i]}->{names[j]} is {a[j, i]:g} ({balance})"
         )
-        raise ModelError("network", None, expected)
+        raise ModelError("network", f"{names[j]}->{names[i]}", expected)
 
 
 def _components(a: Array) -> str:

@@ -16,9 +16,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from zfusion.methods.consensus.mixing import Mixing
-from zfusion.methods.gramians import lyapunov
-from zfusion.methods.riccati import predictor
+from zfusion.methods.consensus.mixing import Mixing, Spectrum
+from zfusion.methods.gramians import lyapunov, predictor_by_doubling, sylvester
 from zfusion.model.checks import ModelError
 from zfusion.model.types import Array
 
@@ -26,6 +25,12 @@ Complex = NDArray[np.complex128]
 
 NO_LEAK = 1e-12
 """Signal that leaks into the disagreement, in parts of the whole, below which it is rounding."""
+
+GRID = 40
+"""Step sizes that are tried at first: what is least of them is near the best one, as the errors vary slowly."""
+
+NARROWED = 24
+"""Golden sections of the interval around it: to a hundred thousandth of its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,7 @@ class Observed:
 
 def steady_filter(A: Array, C: Array, W: Array, R: Array) -> tuple[Array, Array]:
     """K = S Cᵀ (C S Cᵀ + R)^-1 and (I - K C) S, for S the stationary covariance of the prediction."""
-    S = predictor(A, C, W, R)
+    S = predictor_by_doubling(A, C, W, R)
     K: Array = np.linalg.solve(C @ S @ C.T + R, C @ S).T.astype(np.float64, copy=False)
     P = (np.eye(len(A)) - K @ C) @ S
     return K, 0.5 * (P + P.T)
@@ -73,51 +78,85 @@ def alone(observed: Observed) -> Array:
 def error_covariances(observed: Observed, mixing: Mixing) -> Array:
     """Σ_i, the stationary covariance of s - ŝ_i at each node, (N, nx, nx).
 
-    The state [α; ε_s; p; e_i] of the disagreement and the errors is a linear system driven by w and v; its stationary
-    covariance solves X = F X Fᵀ + G Qn Gᵀ.
+    What the nodes disagree in, z = [α; ε_s; p], drives the error of each: with n = [w; v], cov n = Qn,
+    z <- F z + G n and e_i <- B e_i + C_i z + G_i n. Their covariances solve
+        Z = F Z Fᵀ + G Qn Gᵀ,    Y_i = F Y_i Bᵀ + F Z C_iᵀ + G Qn G_iᵀ,
+        Σ_i = B Σ_i Bᵀ + C_i Z C_iᵀ + C_i Y_i Bᵀ + (C_i Y_i Bᵀ)ᵀ + G_i Qn G_iᵀ.
 
     ModelError where the nodes' noises differ and the process drifts so that the lag error grows without bound.
     """
-    A, C, Wp = observed.A, observed.C, observed.Wp
-    nx, (N, m) = len(A), observed.Q.shape[:2]
-    K, _ = observed.centralised
+    F, G, C, G_nodes, B = _system(observed, mixing)
+    noise = _joined(observed.Wp, observed.Q)
+    Z = lyapunov(F, G @ noise @ G.T)
+    Y = sylvester(F, B, F @ Z @ C.transpose(0, 2, 1) + G @ noise @ G_nodes.transpose(0, 2, 1))
+    crossed = C @ Y @ B.T
+    entering = C @ Z @ C.transpose(0, 2, 1) + crossed + crossed.transpose(0, 2, 1)
+    found = sylvester(B, B, entering + G_nodes @ noise @ G_nodes.transpose(0, 2, 1))
+    return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+
+
+def _system(observed: Observed, mixing: Mixing) -> tuple[Array, Array, Array, Array, Array]:
+    """F, G, C_i, G_i and B of `error_covariances`; with N nodes in the first axis of C and G_i."""
+    A, C, nx, (N, m) = observed.A, observed.C, len(observed.A), observed.Q.shape[:2]
+    size, K = N * m, observed.centralised[0]
     vectors, factors = mixing.spectrum.vectors[:, 1:], mixing.factors[1:]
-    disagree = np.kron((vectors * factors) @ vectors.T, np.eye(m))  # W~, (N m, N m)
+    disagree: Array = np.kron((vectors * factors) @ vectors.T, np.eye(m)).astype(np.float64)  # W~, (N m, N m)
     D = _block_diagonal(observed.information)
-    stacked = np.tile(np.eye(m), (N, 1))
-    leak = disagree @ D @ stacked @ C
-    if np.abs(leak).max() <= NO_LEAK * np.abs(D @ stacked @ C).max():
-        B, moving, entering = np.zeros((nx, 0)), np.zeros((0, 0)), np.zeros((0, nx))
-    else:
-        B, moving, entering = _increments(A)
-    noise = _joined(Wp, observed.Q)
-    r, size = B.shape[1], N * m
-    lagging = size if r or np.abs(leak).max() > NO_LEAK else 0
-    total = r + lagging + size
-    F, G = np.zeros((total, total)), np.zeros((total, nx + size))
-    a, s, p = slice(0, r), slice(r, r + lagging), slice(r + lagging, total)
-    F[a, a], G[a, :nx] = moving, entering
-    if lagging:
-        F[s, a], F[s, s], G[s, :nx] = leak @ B, disagree, leak
+    weighed = D @ np.tile(C, (N, 1))
+    leak = disagree @ weighed
+    leaks = bool(np.abs(leak).max() > NO_LEAK * np.abs(weighed).max())
+    basis, moving, change = _increments(A) if leaks else (np.zeros((nx, 0)), np.zeros((0, 0)), np.zeros((0, nx)))
+    r = basis.shape[1]
+    lagging = size if leaks else 0
+    a, s, p = slice(0, r), slice(r, r + lagging), slice(r + lagging, r + lagging + size)
+    F, G = np.zeros((p.stop, p.stop)), np.zeros((p.stop, nx + size))
+    F[a, a], G[a, :nx] = moving, change
     F[p, p], G[p, nx:] = disagree, disagree @ (disagree - np.eye(size)) @ D
     corrected = np.eye(nx) - K @ C
-    inverse = np.linalg.inv(D.reshape(N, m, N, m).sum(axis=(0, 2)) / N)  # Mbar^-1 = N Q_LS
     shares = np.einsum("ab,jbc->ajc", observed.pooled, observed.information).reshape(m, size)
-    covariances = []
-    for i in range(N):
-        rows = slice(i * m, (i + 1) * m)
-        gain = K @ inverse
-        Fi, Gi = np.zeros((nx, total + nx)), np.zeros((nx, nx + size))
-        Fi[:, total:] = corrected @ A
-        if lagging:
-            Fi[:, a], Fi[:, s] = -gain @ (leak @ B)[rows], -gain @ disagree[rows]
-        Fi[:, p] = -gain @ np.eye(size)[rows]
-        Gi[:, :nx] = corrected - gain @ leak[rows]
-        Gi[:, nx:] = -K @ shares - gain @ (disagree @ D)[rows]
-        F_all = np.block([[F, np.zeros((total, nx))], [Fi]])
-        G_all = np.vstack((G, Gi))
-        covariances.append(lyapunov(F_all, G_all @ noise @ G_all.T)[total:, total:])
-    return np.array(covariances)
+    gain = K @ (N * observed.pooled)  # K Mbar^-1
+
+    def of_nodes(rows: Array) -> Array:
+        """-K Mbar^-1 times each node's m rows, (N, nx, ...)."""
+        return np.asarray(-gain @ rows.reshape(N, m, -1))
+
+    C_nodes, G_nodes = np.zeros((N, nx, p.stop)), np.zeros((N, nx, nx + size))
+    C_nodes[:, :, p] = of_nodes(np.eye(size))
+    G_nodes[:, :, :nx] = corrected
+    G_nodes[:, :, nx:] = of_nodes(disagree @ D) - K @ shares
+    if leaks:
+        F[s, a], F[s, s], G[s, :nx] = leak @ basis, disagree, leak
+        C_nodes[:, :, a], C_nodes[:, :, s] = of_nodes(leak @ basis), of_nodes(disagree)
+        G_nodes[:, :, :nx] += of_nodes(leak)
+    return F, G, C_nodes, G_nodes, corrected @ A
+
+
+def tuned_step(observed: Observed, spectrum: Spectrum, rounds: int) -> float:
+    """The step size in (0, 2/λ_N) for which the mean of tr Σ_i over the nodes is least: a grid, then golden sections.
+
+    ModelError as for `error_covariances`.
+    """
+
+    def cost(step: float) -> float:
+        return float(np.einsum("iaa->", error_covariances(observed, Mixing(spectrum, rounds, step))))
+
+    width = spectrum.largest_step / GRID
+    tried = [cost((n + 0.5) * width) for n in range(GRID)]
+    best = int(np.argmin(tried))
+    low, high = max(best - 0.5, 0.0) * width, min(best + 1.5, float(GRID)) * width
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    inner = [high - golden * (high - low), low + golden * (high - low)]
+    costs = [cost(step) for step in inner]
+    for _ in range(NARROWED):
+        if costs[0] <= costs[1]:
+            high, inner[1], costs[1] = inner[1], inner[0], costs[0]
+            inner[0] = high - golden * (high - low)
+            costs[0] = cost(inner[0])
+        else:
+            low, inner[0], costs[0] = inner[0], inner[1], costs[1]
+            inner[1] = low + golden * (high - low)
+            costs[1] = cost(inner[1])
+    return float(inner[int(costs[1] < costs[0])])
 
 
 def _increments(A: Array) -> tuple[Array, Array, Array]:

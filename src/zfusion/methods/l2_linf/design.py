@@ -10,10 +10,11 @@ import numpy as np
 
 from zfusion.methods import design_files
 from zfusion.methods.convex import DesignError
+from zfusion.methods.family import Forecast
 from zfusion.methods.l2_linf.alternation import alternate as alternated_gains
 from zfusion.methods.l2_linf.lmi import SLACK_FAILURE, Designed, Form, diagonal_design, slack_design
 from zfusion.methods.l2_linf.problem import Gains, Problem
-from zfusion.methods.l2_linf.verify import certify, lower_bound, radius, worst_disturbance
+from zfusion.methods.l2_linf.verify import certify, lower_bound, node_errors, radius, worst_disturbance
 from zfusion.model.types import Array, NodeId, sorted_ids
 
 METHOD = "l2_linf"
@@ -57,6 +58,24 @@ class Design:
     """Of the slack; None where the Lyapunov function is the paper's diag(R, Q(s))."""
     lower_bound: float | None = None
     """What no linear filter can beat, where that is known."""
+
+    @property
+    def forecast(self) -> Forecast:
+        """Of the one-step predictors; gammas are for disturbances in units of their standard deviations."""
+        totals: dict[str, float | str | None] = {
+            "gamma": self.gamma,
+            "gamma_certified": self.certified,
+            "gamma_reached": self.worst,
+            "gamma_lower_bound": self.lower_bound,
+            "radius": self.radius,
+        }
+        totals |= {"form": self.form, "tau": self.tau, "rounds": float(self.rounds)}
+        totals |= {"solver": self.solver, "solver_seconds": self.solver_seconds}
+        return Forecast(
+            totals,
+            {"mse": node_errors(self.problem, self.gains).tolist()},
+            ("the method bounds the worst case; errors by node are those under the system's own noises",),
+        )
 
     @property
     def fingerprint(self) -> str:

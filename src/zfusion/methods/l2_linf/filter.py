@@ -179,4 +179,5 @@ L2_LINF = Family(
     options=L2LinfOptions,
     designer=_Designer(),
     check=_check,
+    note="l2_linf: the estimate of a step does not use that step's measurements; what it bounds is the worst case",
 )

@@ -107,6 +107,22 @@ def next_moments(problem: Problem, motions: list[Closed], X: Array) -> Array:
     return following
 
 
+def node_errors(problem: Problem, gains: Gains) -> Array:
+    """Stationary mean squared errors E|x - x̂_i|² under white noise of unit variance, over misses and modes, (n,)."""
+    motions, chances = closed(problem, gains), problem.stationary_modes
+    noises = np.array([chance * motion.B @ motion.B.T for chance, motion in zip(chances, motions, strict=True)])
+    entering: Array = np.tensordot(problem.transition.T, noises, 1)
+    X = entering
+    for _ in range(RADIUS_STEPS):
+        following = next_moments(problem, motions, X) + entering
+        settled = np.abs(following - X).max() <= RADIUS_CONVERGED * np.abs(following).max()
+        X = following
+        if settled:
+            break
+    errors = np.diagonal(X.sum(axis=0))[problem.nx :]
+    return np.asarray(errors.reshape(problem.n, problem.nx).sum(axis=1))
+
+
 def moment(motion: Closed, X: Array) -> Array:
     """A X Aᵀ + Σ_i A_i X A_iᵀ."""
     moved = motion.A @ X @ motion.A.T

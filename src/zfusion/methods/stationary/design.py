@@ -10,8 +10,15 @@ import numpy as np
 
 from zfusion.methods import design_files
 from zfusion.methods.convex import DesignError
+from zfusion.methods.family import Forecast
 from zfusion.methods.stationary.cost import Cost, Gains, evaluate, rescaled
-from zfusion.methods.stationary.limits import centralized_mse, information_limit, local_predictors, neighbourhood_mse
+from zfusion.methods.stationary.limits import (
+    centralized_mse,
+    information_limit,
+    local_predictors,
+    neighbourhood_mse,
+    own_sensor_mse,
+)
 from zfusion.methods.stationary.lmi import Choice
 from zfusion.methods.stationary.lmi import design as convex_design
 from zfusion.methods.stationary.problem import Plant, Problem
@@ -69,6 +76,22 @@ class Design:
         rows, states = slice(i * plant.nx, (i + 1) * plant.nx), slice(j * plant.nx, (j + 1) * plant.nx)
         F, G, H = self.gains
         return F[rows, states], G[rows, end - plant.ny[j] : end], H[rows, states]
+
+    @property
+    def forecast(self) -> Forecast:
+        """Of the one-step predictors; sums over the nodes are weighted as the design's."""
+        nodes = {"mse": self.mse, "bound": self.node_bounds, "information_limit": self.information_limit}
+        nodes |= {"neighbourhood": self.neighbourhood_mse, "own_sensor": own_sensor_mse(self.problem.nominal)}
+        known = {name: values.tolist() for name, values in nodes.items() if values is not None}
+        totals: dict[str, float | str | None] = {"bound": self.bound, "true_cost": self.J}
+        totals |= {
+            f"{name}_sum": float(self.problem.weights @ values)
+            for name, values in nodes.items()
+            if values is not None and name not in ("mse", "bound")
+        }
+        totals |= {"centralized_mse": self.centralized_mse, "solver": self.solver or "descent only"}
+        totals |= {"solver_seconds": self.solver_seconds, "descent_iterations": float(self.iterations)}
+        return Forecast(totals, known, ("errors are those of the one-step predictors, which do not know y(k) yet",))
 
     @property
     def fingerprint(self) -> str:

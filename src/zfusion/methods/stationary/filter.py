@@ -155,6 +155,7 @@ class _Designer:
 
 
 def _check(options: StationaryOptions, system: System, network: Network) -> None:
+    options.choice  # noqa: B018 - raises what does not go together
     problem_of(system, network, exchange_measurements=options.exchange_measurements)
 
 
@@ -165,4 +166,5 @@ STATIONARY = Family(
     options=StationaryOptions,
     designer=_Designer(),
     check=_check,
+    note="stationary: without the option filtered, the estimate of a step does not use that step's measurements",
 )

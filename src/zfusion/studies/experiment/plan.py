@@ -194,5 +194,6 @@ def _files(scenario: Scenario) -> dict[str, str]:
 
     for i in scenario.ids:
         scenario.source_of(i).with_paths(note)
-    scenario.links.with_paths(lambda path: note(str(scenario.absolute(path))))
+    for piece in (scenario.links, scenario.method):
+        piece.with_paths(lambda path: note(str(scenario.absolute(path))))
     return found

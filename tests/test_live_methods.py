@@ -1,0 +1,138 @@
+"""Every method as a swarm of processes over Zenoh, recorded, and proven by its recording; and in bad weather."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarms import launch, variant
+from zfusion.drivers.replayed import verify
+from zfusion.drivers.simulated import simulate
+from zfusion.methods import METHODS
+from zfusion.methods.check import check_method
+from zfusion.model.scenario import Scenario
+from zfusion.model.types import Array
+from zfusion.recording import Recording
+from zfusion.stages import Message
+
+SCENARIO = """
+seed = 3
+[network]
+generator = "complete"
+[system]
+F = [[0.9, 0.2], [0, 0.8]]
+Q = { diagonal = [0.1, 0.2] }
+initial_mean = [1.0, 0.0]
+initial_covariance = { diagonal = [1.0, 1.0] }
+[[sensors]]
+id = 1
+H = [[1.0, 0.5]]
+R = 0.5
+[[sensors]]
+id = 2
+H = [[1.0, 0.5]]
+R = 0.3
+"""
+"""Stable, constant, white and uncorrelated, everybody measures the same: there is no method that cannot stand it."""
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "consensus": {"rounds": 2, "step_size": "tuned"},
+    "hybrid_consensus": {"rounds": 2},
+    "l2_linf": {"output": [[1.0, 0.0]]},
+}
+"""Where it is not the defaults."""
+
+PROVEN_ELSEWHERE = ("two_stage", "local", "centralized")
+"""In the tests of the live swarm itself."""
+
+NAMES = [name for name in METHODS if name not in PROVEN_ELSEWHERE]
+UNDESIGNED = [name for name in NAMES if METHODS[name].designer is None]
+STEPS = 8
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("methods") / "base.toml"
+    path.write_text('name = "base"\n' + SCENARIO)
+    return path
+
+
+def test_each_method_runs_live_and_its_recording_proves_it(base: Path, tmp_path: Path) -> None:
+    """One after the other in one test: what takes time is to start the processes."""
+    for name in UNDESIGNED:
+        scenario = variant(tmp_path, name, base, method={"name": name, "options": OPTIONS.get(name, {})})
+        file = tmp_path / f"{name}.mcap"
+        result = launch(tmp_path, scenario, "--free-run", "--steps", STEPS, "--record", file)
+        assert result.code == 0, (name, result.err)
+        assert result.summary["completed_steps"] == {"1": STEPS, "2": STEPS}
+        assert not result.summary["refused"]
+        assert_proven(file, name, 2 * STEPS * len(METHODS[name].choose(OPTIONS.get(name, {})).stages))
+
+
+def assert_proven(file: Path, name: str, least: int) -> None:
+    """All estimates of a recording come out as they were, bit for bit."""
+    with Recording.open(file) as recording:
+        verdict = verify(recording)
+    assert (verdict.different, verdict.missing_count) == (0, 0), name
+    assert verdict.identical >= least, name
+
+
+def foul(name: str, seed: int, loss: float, delay_ms: int, kill: int, restart: int) -> Scenario:
+    """Four nodes in a ring, with losses, delays of up to several steps, a node that dies and, perhaps, comes back."""
+    document = tomllib.loads('name = "foul"' + SCENARIO)
+    document |= {"seed": seed, "steps": 16, "network": {"generator": "ring"}}
+    document["sensors"] = [{"id": i, "H": [[1.0, 0.5]], "R": 0.5} for i in (1, 2, 3, 4)]
+    document["method"] = {"name": name, "options": OPTIONS.get(name, {})}
+    document["timing"] = {"rate_hz": 100.0}
+    document["links"] = {
+        "loss": loss,
+        "delay": {"distribution": "exponential", "mean": delay_ms / 1000},
+        "duplicate": 0.1,
+        "reorder": True,
+    }
+    back = {"restart_after": restart} if restart else {}
+    document["faults"] = [
+        {"kind": "kill", "node": 2, "step": kill, **back},
+        {"kind": "stop", "node": 3, "step": 5, "steps": 3},
+    ]
+    return Scenario.model_validate(document)
+
+
+@pytest.mark.parametrize("name", UNDESIGNED)
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    loss=st.sampled_from([0.0, 0.2, 0.7]),
+    delay_ms=st.integers(1, 25),
+    kill=st.integers(1, 12),
+    restart=st.integers(0, 4),
+)
+def test_no_weather_is_too_bad(
+    tmp_path_factory: pytest.TempPathFactory,
+    name: str,
+    seed: int,
+    loss: float,
+    delay_ms: int,
+    kill: int,
+    restart: int,
+) -> None:
+    scenario = foul(name, seed, loss, delay_ms, kill, restart)
+    check_method(scenario, "foul")
+    file = tmp_path_factory.mktemp("foul") / "foul.mcap"
+    found: list[bool] = []
+
+    def observe(message: Message, _: int) -> None:
+        if message.stage == "estimate":
+            P = cast(Array, message.fields["P"])
+            found.append(bool(np.isfinite(cast(Array, message.fields["x"])).all() and np.linalg.eigvalsh(P)[0] > 0))
+
+    simulate(scenario, run="r", output=file, observe=observe)
+    assert len(found) > 30
+    assert all(found)
+    assert_proven(file, name, 30)
