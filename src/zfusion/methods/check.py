@@ -75,7 +75,7 @@ def _stage_problems(scenario: Scenario, method: Chosen) -> Iterator[Problem]:
     stages = [stage.name for stage in method.stages]
     default = [stage.name for family in METHODS.values() for stage in family.stages(family.options())]
     known = dict.fromkeys((*stages, *default))
-    expected = f"expected a stage: {', '.join(known)}"
+    expected = f"expected a stage: {', '.join(stages)}"
     for stage, fraction in scenario.timing.deadlines.items():
         if stage not in known:
             yield Problem(f"timing.deadlines.{stage}", fraction, expected)
