@@ -211,7 +211,7 @@ class RunFacts:
         for step in steps:
             if timing.period_ns is not None and epoch is not None:
                 due = epoch + step * timing.period_ns
-                waits = getattr(timing, "late", "drop") == "wait"
+                waits = timing.late == "wait"
                 deadlines = {} if waits else {s: due + deadline_ns(self.scenario, s) for s in self.stages}
                 rounds.append(Round(step, due, deadlines))
             elif sent := [f.sent_ns for f in flights if f.step == step]:

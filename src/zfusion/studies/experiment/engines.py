@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -16,9 +13,7 @@ from typing import Any, Protocol
 from zfusion.errors import InputError
 from zfusion.studies.experiment.execute import Result, execute
 from zfusion.studies.experiment.plan import Task
-
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""The matrices are small: threads of a BLAS would only be in the other runs' way."""
+from zfusion.studies.parallel import workers
 
 DIED = "its process died: killed, or out of memory"
 
@@ -46,10 +41,10 @@ def in_processes(tasks: Sequence[Task], jobs: int) -> Results:
     left, jobs = list(reversed(tasks)), min(jobs, len(tasks))
     while left:
         suspects: list[Task] = []
-        with _pool(jobs) as pool:
+        with workers(jobs) as pool:
             yield from _through(pool, left, jobs, suspects)
         for task in suspects:  # one of them brought down the pool: each by itself shows which
-            with _pool(1) as pool:
+            with workers(1) as pool:
                 alone: list[Task] = []
                 yield from _through(pool, [task], 1, alone)
                 if alone:
@@ -77,29 +72,6 @@ def _through(pool: ProcessPoolExecutor, left: list[Task], jobs: int, suspects: l
                 yield task, result
         if suspects and not under_way:
             return
-
-
-@contextmanager
-def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes that are gone afterwards, even if they are in the middle of something."""
-    before = set(multiprocessing.active_children())
-    kept = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update({name: value for name, value in ONE_THREAD.items() if kept[name] is None})
-    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_leave_signals)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - before:
-            child.kill()
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-
-
-def _leave_signals() -> None:
-    """Ctrl-C is for the parent to handle."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def on_dask(tasks: Sequence[Task], scheduler: str, jobs: int) -> Results:
