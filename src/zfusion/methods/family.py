@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.protocol import Method, Setting
 from zfusion.model.checks import ModelError
 from zfusion.model.network import Network
@@ -53,6 +54,9 @@ class Design(Protocol):
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
 
+    def packed(self) -> bytes:
+        """What such an archive holds."""
+
 
 class Designer(Protocol):
     """How a method is designed off-line."""
@@ -60,8 +64,8 @@ class Designer(Protocol):
     def make(self, options: Any, system: System, network: Network, modes: Modes) -> Design:
         """Design it: InputError where that cannot be done, with the numbers."""
 
-    def load(self, path: Path, options: Any, system: System, network: Network, modes: Modes) -> Design:
-        """Read what `Design.save` wrote; InputError unless it is a design for just this."""
+    def unpack(self, content: Content, options: Any, system: System, network: Network, modes: Modes) -> Design:
+        """What `Design.packed` has packed; InputError unless it is a design for just this."""
 
 
 def _as_it_is(graph: Network) -> Network:

@@ -100,6 +100,10 @@ class Design:
 
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
+        design_files.write(path, self.packed())
+
+    def packed(self) -> bytes:
+        """What such an archive holds."""
         arrays: dict[str, Any] = {
             "ids": design_files.stored_ids(self.ids),
             **self.gains._asdict(),
@@ -110,12 +114,17 @@ class Design:
         for name in OPTIONAL:
             if (value := getattr(self, name)) is not None:
                 arrays[name] = value
-        design_files.save(path, METHOD, self.fingerprint, arrays)
+        return design_files.packed(METHOD, self.fingerprint, arrays)
 
     @classmethod
     def load(cls, path: Path, made_for: str | None = None) -> Self:
         """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
-        arrays: dict[str, Any] = design_files.load(path, METHOD, made_for)
+        return cls.unpack(design_files.read(path), made_for)
+
+    @classmethod
+    def unpack(cls, content: design_files.Content, made_for: str | None = None) -> Self:
+        """As `load`, of what is in a file."""
+        arrays: dict[str, Any] = design_files.unpack(content, METHOD, made_for)
         gains = Gains(arrays["F"], arrays["G"], arrays["H"])
         told = {name: arrays[name].tolist() if arrays[name].ndim == 0 else arrays[name] for name in SCALARS}
         told |= {

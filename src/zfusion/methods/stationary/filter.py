@@ -12,11 +12,11 @@ estimate is unbiased from the first step on, and its covariance is known from th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.family import Family, Modes
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.stationary.cost import evaluate, extended
@@ -150,8 +150,14 @@ class _Designer:
         return options.design(system, network)
 
     @staticmethod
-    def load(path: Path, options: StationaryOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
-        return Design.load(path, options.fingerprint(system, network))
+    def unpack(
+        content: Content,
+        options: StationaryOptions,
+        system: System,
+        network: Network,
+        modes: Modes,  # noqa: ARG004
+    ) -> Design:
+        return Design.unpack(content, options.fingerprint(system, network))
 
 
 def _check(options: StationaryOptions, system: System, network: Network) -> None:
