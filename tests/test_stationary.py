@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lmi_examples import GRAPHS, IDS, designed, plant, polytope
+from lmi_examples import GRAPHS, IDS, designed, example, plant, polytope
+from zfusion.drivers.designs import make
 from zfusion.errors import InputError
 from zfusion.methods import convex
 from zfusion.methods.convex import DesignError
@@ -292,8 +293,9 @@ NOMINAL = {"PATH": (5.8627, 4.5919), "RING": (6.8158, 4.7961)}
 @pytest.mark.slow
 def test_robust_designs_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     """(O) and the descent from it on the path; a hundred steps of descent are past the reference's."""
-    problem = Problem.of(polytope(), GRAPHS["PATH"])
-    robust = make_design(IDS, problem)
+    robust = make(example("stationary_robust", network={"matrix": GRAPHS["PATH"].tolist()}))
+    assert isinstance(robust, Design)
+    problem = robust.problem
     assert robust.bound == pytest.approx(4.2380, abs=DIGITS)
     assert worst(problem, robust.gains) == pytest.approx(4.1323, abs=DIGITS)
     monkeypatch.setattr(refine_module, "OPTIONS", refine_module.OPTIONS | {"maxiter": 100})

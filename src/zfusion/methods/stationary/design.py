@@ -37,6 +37,13 @@ TOLERANCE = 1e-5
 """By how much of itself a cost may exceed its bound: what the solver's own accuracy makes of a tight one."""
 
 
+PREDICTORS = "errors are those of the one-step predictors, which do not know y(k) yet"
+
+ROBUST = (
+    "bounds hold for every system of the polytope; the worst vertex aside, all else is for the scenario's own system"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """The gains of all nodes, what was promised, and what they really do.
@@ -51,9 +58,9 @@ class Design:
     J: float
     """The weighted sum of the mean squared errors; for a polytope, the largest of its vertices."""
     mse: Array
-    """Of each node, (n,), at the first vertex."""
+    """Of each node, (n,), with the nominal plant."""
     information_limit: Array
-    """What no estimator of this structure can beat, (n,), at the first vertex."""
+    """What no estimator of this structure can beat, (n,), with the nominal plant."""
     neighbourhood_mse: Array
     """Of the Kalman predictors with the neighbourhoods' measurements, (n,)."""
     centralized_mse: float
@@ -83,7 +90,12 @@ class Design:
         nodes = {"mse": self.mse, "bound": self.node_bounds, "information_limit": self.information_limit}
         nodes |= {"neighbourhood": self.neighbourhood_mse, "own_sensor": own_sensor_mse(self.problem.nominal)}
         known = {name: values.tolist() for name, values in nodes.items() if values is not None}
-        totals: dict[str, float | str | None] = {"bound": self.bound, "true_cost": self.J}
+        cost = float(self.problem.weights @ self.mse)
+        totals: dict[str, float | str | None] = {"bound": self.bound, "true_cost": cost}
+        corners, remarks = len(self.problem.vertices), [PREDICTORS]
+        if corners > 1:
+            totals |= {"vertices": float(corners), "worst_vertex_cost": self.J}
+            remarks.append(ROBUST)
         totals |= {
             f"{name}_sum": float(self.problem.weights @ values)
             for name, values in nodes.items()
@@ -91,7 +103,7 @@ class Design:
         }
         totals |= {"centralized_mse": self.centralized_mse, "solver": self.solver or "descent only"}
         totals |= {"solver_seconds": self.solver_seconds, "descent_iterations": float(self.iterations)}
-        return Forecast(totals, known, ("errors are those of the one-step predictors, which do not know y(k) yet",))
+        return Forecast(totals, known, tuple(remarks))
 
     @property
     def fingerprint(self) -> str:
@@ -203,7 +215,7 @@ def fingerprint(ids: tuple[NodeId, ...], problem: Problem) -> str:
     """Of a problem: what a design file must have been made for."""
     parts: list[tuple[str, object]] = [("ids", str(ids)), ("weights", problem.weights)]
     parts += [(name, getattr(problem, name)) for name in ("F", "G", "H")]
-    for plant in problem.vertices:
+    for plant in _plants(problem).values():
         parts += [("A", plant.A), ("C", plant.stacked_C), ("Q", plant.Q), ("R", plant.R)]
     return design_files.fingerprint(parts)
 
@@ -237,23 +249,31 @@ def _stored(problem: Problem) -> dict[str, Any]:
     """The problem as arrays: the plants' covariances Q = B W B' and R = D V D' say all that matters of the noises."""
     arrays: dict[str, Any] = {"vertices": len(problem.vertices), "ny": problem.nominal.ny, "weights": problem.weights}
     arrays |= {f"graph_{name}": getattr(problem, name) for name in ("F", "G", "H")}
-    for v, plant in enumerate(problem.vertices):
+    for name, plant in _plants(problem).items():
         arrays |= {
-            f"plant{v}_A": plant.A,
-            f"plant{v}_C": plant.stacked_C,
-            f"plant{v}_Q": plant.Q,
-            f"plant{v}_R": plant.R,
+            f"{name}_A": plant.A,
+            f"{name}_C": plant.stacked_C,
+            f"{name}_Q": plant.Q,
+            f"{name}_R": plant.R,
         }
     return arrays
+
+
+def _plants(problem: Problem) -> dict[str, Plant]:
+    """The vertices, and the center where there is one, by the names that they have in files."""
+    plants = {f"plant{v}": plant for v, plant in enumerate(problem.vertices)}
+    return plants if problem.center is None else plants | {"center": problem.center}
 
 
 def _restored(arrays: dict[str, Any]) -> Problem:
     ends = np.cumsum(arrays["ny"]).tolist()
     rows = [slice(end - size, end) for end, size in zip(ends, arrays["ny"].tolist(), strict=True)]
-    plants = []
-    for v in range(int(arrays["vertices"])):
-        A, C, Q, R = (arrays[f"plant{v}_{name}"] for name in "ACQR")
+
+    def plant(name: str) -> Plant:
+        A, C, Q, R = (arrays[f"{name}_{matrix}"] for matrix in "ACQR")
         D = tuple(np.eye(at.stop - at.start) for at in rows)
-        plants.append(Plant(A, np.eye(len(A)), tuple(C[at] for at in rows), D, Q, tuple(R[at, at] for at in rows)))
+        return Plant(A, np.eye(len(A)), tuple(C[at] for at in rows), D, Q, tuple(R[at, at] for at in rows))
+
+    plants = tuple(plant(f"plant{v}") for v in range(int(arrays["vertices"])))
     F, G, H = (arrays[f"graph_{name}"] for name in "FGH")
-    return Problem(tuple(plants), F, G, H, arrays["weights"])
+    return Problem(plants, F, G, H, arrays["weights"], plant("center") if "center_A" in arrays else None)

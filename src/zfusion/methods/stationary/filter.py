@@ -21,7 +21,6 @@ from zfusion.methods.family import Family, Modes
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.stationary.cost import evaluate, extended
 from zfusion.methods.stationary.design import METHOD, Design
-from zfusion.methods.stationary.mapping import problem_of
 from zfusion.methods.stationary.options import StationaryOptions
 from zfusion.methods.stationary.substitution import NodeGains, Substitution, There
 from zfusion.model.network import Network
@@ -162,7 +161,7 @@ class _Designer:
 
 def _check(options: StationaryOptions, system: System, network: Network) -> None:
     options.choice  # noqa: B018 - raises what does not go together
-    problem_of(system, network, exchange_measurements=options.exchange_measurements)
+    options.problem(system, network)
 
 
 STATIONARY = Family(
