@@ -99,6 +99,35 @@ def test_observer_type_of_the_reference() -> None:
     assert np.abs(unbiased).max() < 1e-6
 
 
+@pytest.mark.parametrize(("graph", "optimum", "free"), [("PATH", 3.7321, 3.46332), ("RING", 3.9589, 3.58652)])
+def test_true_cost_optimum_of_the_observer_type(graph: str, optimum: float, free: float) -> None:
+    """From the convex design, and from none: one's own Kalman filter as an observer. 7 to 10 % above the free type."""
+    problem = Problem.of(plant(), GRAPHS[graph])
+    start = designed(graph, Choice(observer=True)).gains
+    F, G, _ = local_predictors(problem)
+    for gains in (start, Gains(F, -G, -np.eye(12))):
+        found = refine_module.refine(problem, gains, observer=True).gains
+        J = evaluate(problem, found).J
+        assert pytest.approx(optimum, abs=DIGITS) == J
+        assert 1.07 * free < J < 1.11 * free
+        unbiased = found.F @ problem.E - found.G @ problem.nominal.stacked_C - problem.E @ plant().A
+        assert np.abs(unbiased).max() < 1e-12
+        assert not found.F[~problem.blocks.F].any()
+        assert not found.G[~problem.blocks.G].any()
+
+
+def test_a_refined_observer_is_one() -> None:
+    problem = Problem.of(small_plant(), np.ones((2, 2)))
+    design = make_design((1, 2), problem, Choice(observer=True), refine=True)
+    np.testing.assert_array_equal(design.gains.H, -np.eye(4))
+    assert design.J <= make_design((1, 2), problem, Choice(observer=True)).J
+    with pytest.raises(InputError, match="not for the observer type"):
+        make_design((1, 2), problem, Choice(observer=True), refine=True, doubt=0.1)
+    alone = make_design((1, 2), problem, Choice(observer=True), convex=False)
+    np.testing.assert_array_equal(alone.gains.H, -np.eye(4))
+    assert pytest.approx(design.J, rel=1e-5) == alone.J
+
+
 def random_problem(seed: int) -> Problem:
     rng = np.random.default_rng(seed)
     n, nx = 3, 2

@@ -33,7 +33,7 @@ class Modes(NamedTuple):
 class Forecast(NamedTuple):
     """What is known of a method's errors before it runs; what nothing is known of is left out, or None.
 
-    Names are words joined by "_". Mean squared errors are stationary, with every message there.
+    Names are words joined by "_". Mean squared errors are stationary.
     """
 
     network: Mapping[str, float | str | None]
@@ -42,6 +42,8 @@ class Forecast(NamedTuple):
     """By what it is a number for every node, in the order of their ids."""
     remarks: Sequence[str] = ()
     """What a reader of the numbers must know, in sentences."""
+    given: str = "with every message there"
+    """What they take for granted of the links."""
 
 
 class Design(Protocol):
@@ -76,6 +78,10 @@ def _none(_: object) -> int:
     return 0
 
 
+def _no_warnings(options: object, system: System, network: Network) -> Sequence[str]:  # noqa: ARG001
+    return ()
+
+
 @dataclass(frozen=True)
 class Family:
     """A method of estimation, whatever its options are."""
@@ -100,6 +106,8 @@ class Family:
     """Refuses, with an InputError or ModelError, a system or a network that the method cannot stand."""
     note: str = ""
     """What a user of the method must know of every run: told in its summary."""
+    warnings: Callable[[Any, System, Network], Sequence[str]] = _no_warnings
+    """What a user must know of just this system, with these options: likewise."""
 
     def choose(self, options: Mapping[str, object]) -> Chosen:
         """The method with these options, as a scenario gives them; ModelError for what cannot be."""

@@ -197,14 +197,17 @@ def make_design(
         }
         promised["solver"] = f"{designed.solved.solver}: {designed.solved.status}"
     else:
-        gains = local_predictors(problem)
+        gains = _as_observers(local_predictors(problem)) if choice.observer else local_predictors(problem)
         worst = _worst(problem, gains)
     if refine:
-        doubt = (0.0 if convex or len(problem.vertices) > 1 else DOUBT) if doubt is None else doubt
-        refined = refine_gains(problem, gains, doubt)
+        certain = convex or choice.observer or len(problem.vertices) > 1
+        doubt = (0.0 if certain else DOUBT) if doubt is None else doubt
+        refined = refine_gains(problem, gains, doubt, observer=choice.observer)
         candidate = _worst(problem, refined.gains)
         if candidate.J < worst.J:
-            gains = rescaled(problem, refined.gains, evaluate(problem, refined.gains).P)
+            gains = refined.gains
+            if not choice.observer:
+                gains = rescaled(problem, gains, evaluate(problem, gains).P)
             promised |= {"iterations": refined.iterations, "node_bounds": None}
             if len(problem.vertices) > 1:
                 promised["bound"] = None
@@ -238,6 +241,11 @@ def _told(ids: tuple[NodeId, ...], problem: Problem, gains: Gains, promised: dic
 def _worst(problem: Problem, gains: Gains) -> Cost:
     """The true cost at the vertex where it is largest; DesignError where the estimators are not stable."""
     return max((evaluate(problem, gains, plant) for plant in problem.vertices), key=lambda cost: cost.J)
+
+
+def _as_observers(predictors: Gains) -> Gains:
+    """Kalman predictors, whose ξ is x̂, in the coordinates of the observer type: ξ = -x̂."""
+    return Gains(predictors.F, -predictors.G, -predictors.H)
 
 
 def _check_promise(J: float, bound: float) -> None:
