@@ -217,7 +217,7 @@ NAIVE = {
     "S7": (0.89594, 0.58896),
 }
 CLAIMED = {"S4": (0.27010, 0.27010), "S7": (0.27979, 0.39191)}
-"""By themselves, for one-step predictions; in all other scenes as in S1."""
+"""By themselves, of their predictions for k = 60; in all other scenes as in S1."""
 
 
 def naive_errors(given: Parameters, believed: Parameters) -> tuple[list[float], list[float]]:
@@ -266,11 +266,12 @@ def test_naive_kalman_filters_of_the_reference(scene: str) -> None:
     sure = {"fbar": (1.0, 1.0), "f2": (1.0, 1.0), "g2": given.gbar**2}
     found = [naive_errors(given, example_1(0, **(SCENES[scene] | at_once | ignored))) for ignored in (sure, {})]
     means = [np.mean(errors[30:]) for errors, _ in found]
-    claims = [np.mean(claims[30:]) for _, claims in found]
+    claims = [claims[-1] for _, claims in found]
     np.testing.assert_allclose(means, NAIVE[scene], rtol=0, atol=6e-6)
-    np.testing.assert_allclose(claims, CLAIMED.get(scene, (0.27010, 0.35386)), rtol=0, atol=1.1e-5)
+    np.testing.assert_allclose(claims, CLAIMED.get(scene, (0.27010, 0.35386)), rtol=0, atol=6e-6)
 
 
+@pytest.mark.long
 def test_gains_that_are_best_together_are_those_of_least_squares() -> None:
     """All six gains for tr P_6 of example 1, by BFGS: 2.5 % below the stepwise ones, and where least squares is."""
     minimize = pytest.importorskip("scipy.optimize").minimize
@@ -298,7 +299,7 @@ def test_gains_that_are_best_together_are_those_of_least_squares() -> None:
     assert greedy == pytest.approx(0.4939667551, abs=1e-10)
     assert companion.P.trace() == pytest.approx(0.4815703615, abs=1e-10)
     assert cost(np.array(gains).ravel()) == pytest.approx(greedy, rel=1e-12)
-    found = minimize(cost, np.array(gains).ravel(), method="BFGS", options={"maxiter": 60})
+    found = minimize(cost, np.array(gains).ravel(), method="BFGS", options={"maxiter": 400, "gtol": 1e-9})
     assert found.fun == pytest.approx(0.4815703615, abs=2e-8)
     assert found.fun >= 0.4815703615 - 1e-10
 
