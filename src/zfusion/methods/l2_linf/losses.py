@@ -1,8 +1,8 @@
 """What message loss does to the filters: exact second moments when every link loses messages independently.
 
 A neighbour whose message is missing is taken to believe what the node does (module `filter`): K_ij and θ̄_j H_ij C_j
-then act on the node's own x̂_i. Losses on the links into different nodes are independent, so beside the mean gains only the
-diagonal blocks feel their spread, and that is uncorrelated with all else:
+then act on the node's own x̂_i. Losses on the links into different nodes are independent, so beside the mean gains
+only the diagonal blocks feel their spread, and that is uncorrelated with all else:
 
     X⁺ = [moments of the mean gains] + blockdiag_i Σ_S p_S (W_iS - W̄_i) E[z zᵀ] (W_iS - W̄_i)ᵀ,    z = (x̂; y)
 
