@@ -59,6 +59,10 @@ class Swarm:
         """How far the node is."""
         return int(self.last(node)["step"])
 
+    def taken(self, node: int) -> int:
+        """How many steps have been heard of the node."""
+        return len(self._listeners[node].collect())
+
     def wait_for(self, node: int, step: int) -> None:
         """Until the node has made the step."""
         wait_until(lambda: self.step(node) >= step, f"step {step} of node {node}\n{self.command.said()}")
@@ -147,13 +151,15 @@ def test_a_node_that_dies_is_told_and_the_others_go_on(tmp_path: Path) -> None:
     [failure] = summary["failures"]
     assert failure.startswith("node 2 died at step")
     assert "SIGKILL" in failure
-    assert all(summary["completed_steps"][node] > 130 for node in "134")  # a busy machine may skip some
+    assert all(summary["completed_steps"][node] > 75 for node in "134")  # a busy machine may skip some
     assert 5 <= summary["completed_steps"]["2"] < 150
     messages = running.messages()
     last = max(intermediates(messages, 2))
     used = intermediates(messages, 1)
-    assert used[150] == [1, 3]  # node 1 hears 2 and 3
-    assert used[last - 5] == [1, 2, 3]
+    # Node 1 hears 2 and 3; a busy machine may skip or miss some.
+    assert [1, 2, 3] in [taken for step, taken in used.items() if step <= last]
+    assert [1, 3] in [taken for step, taken in used.items() if step > last + 10]
+    assert not any(2 in taken for step, taken in used.items() if step > last + 1)
     gone = [m.payload for m in messages if m.topic.endswith("/event") and m.payload["kind"] == "gone"]
     assert {event["node"] for event in gone if event["data"]["of"] == 2} == {1, 4}
     assert zfusion(tmp_path, "replay", running.recording, "--verify", "--json").code == 0
@@ -184,7 +190,7 @@ def test_a_node_that_dies_is_started_again_and_taken_back_in(tmp_path: Path, pac
     messages = running.messages()
     for neighbour in (1, 4):
         used = intermediates(messages, neighbour)
-        assert used[10] == everybody[neighbour]
+        assert everybody[neighbour] in [taken for step, taken in used.items() if step < born]
         assert any(2 not in used.get(step, [2]) for step in range(20, born))
     verdict = zfusion(tmp_path, "replay", running.recording, "--verify", "--json")
     assert verdict.code == 0, verdict.out + verdict.err
@@ -193,17 +199,18 @@ def test_a_node_that_dies_is_started_again_and_taken_back_in(tmp_path: Path, pac
 def test_the_death_of_the_recorder_ends_the_run_and_costs_one_flush_at_most(tmp_path: Path) -> None:
     with swarm(tmp_path, "--steps", ENDLESS, recording={"flush_interval_s": 0.2}, **PACED) as running:
         running.wait_for(3, 75)
+        taken = running.taken(3)
         running.kill("record")
         result = running.command.wait()
     assert result.code == 1
     summary = result.summary
     assert summary["interrupted"]
     assert summary["failures"] == ["the recorder died: killed by SIGKILL"]
-    assert min(summary["completed_steps"].values()) >= 70
+    assert summary["completed_steps"]["3"] >= taken - 1  # of the last step there may be no estimate
     with Recording.open(running.recording) as recording:
         assert not recording.complete
         # 0.2 s are 10 steps; the rest is what a busy machine may need between two flushes
-        assert recording.topics[f"zfusion/{running.run}/node/3/estimate"] >= 75 - 10 - 25
+        assert recording.topics[f"zfusion/{running.run}/node/3/estimate"] >= taken - 10 - 25
 
 
 def refused(directory: Path, *words: object, run: str | None = None) -> str:
