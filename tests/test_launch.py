@@ -135,10 +135,11 @@ def test_the_recording_says_how_it_was_stopped(summary: dict[str, Any]) -> None:
 
 def test_the_same_seed_gives_the_same_estimates_whatever_the_pace(summary: dict[str, Any], directory: Path) -> None:
     paced = launch(directory, EXAMPLE, "--rate", 20, "--steps", 40, "--record", "paced.mcap").summary
-    assert paced["completed_steps"] == dict.fromkeys(NODES, 40)
-    assert paced["rounds_per_s"] == pytest.approx(20, rel=0.05)
-    assert (paced["lost"], paced["skipped"]) == (0, 0)
-    if paced["missed"] == 0:  # the machine was not too busy for the deadlines
+    assert set(paced["completed_steps"]) == set(NODES)
+    assert sum(paced["completed_steps"].values()) + paced["skipped"] == 4 * 40
+    assert 10 < paced["rounds_per_s"] < 1.05 * 20
+    assert paced["lost"] == 0
+    if paced["missed"] == paced["skipped"] == 0:  # the machine was not too busy for the deadlines
         free = estimates(directory / "free.mcap")
         assert all(free[place] == estimate for place, estimate in estimates(directory / "paced.mcap").items())
 
