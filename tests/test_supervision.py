@@ -103,7 +103,7 @@ def intermediates(messages: list[Recorded], node: int) -> dict[int, list[int]]:
 def test_ctrl_c_ends_the_run_cleanly(tmp_path: Path, timing: dict[str, Any]) -> None:
     words = [] if timing.get("rate_hz") else ["--free-run"]
     with swarm(tmp_path, "--steps", ENDLESS, *words) as running:
-        running.wait_for(1, 20)
+        wait_until(lambda: min(running.taken(int(node)) for node in NODES) > 20, "all have taken steps")
         running.command.interrupt()
         result = running.command.wait()
     assert result.code == 0, result.err
