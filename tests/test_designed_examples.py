@@ -42,7 +42,7 @@ def simulated(scenario: Scenario) -> tuple[Simulation, dict[tuple[str, Any, int]
 
 @pytest.mark.parametrize("name", BOTH)
 def test_errors_of_the_examples_are_as_large_as_predicted(name: str) -> None:
-    """Of independent runs, from the first step on: eᵀP⁻¹e is nx and |e|² is tr P in the mean, within 4.5 sigma of it."""
+    """Of independent runs, from the first step on: eᵀP⁻¹e is nx and |e|² is tr P in the mean, within 4.5 sigma."""
     base, runs = example(name, steps=12), 34
     nees, excess = np.zeros(runs), np.zeros(runs)
     for seed in range(runs):

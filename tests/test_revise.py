@@ -355,7 +355,7 @@ def rough(seed: int) -> Link:
 def test_errors_are_as_large_as_predicted_whatever_becomes_of_what_is_late(timing: dict[str, object]) -> None:
     """NEES, with losses, lateness and a restart. What is published when depends on no data, so its mean is nx = 2.
 
-    A run's mean over its nodes and steps is one sample; the mean over runs may be off by 4.5 of its standard deviations.
+    A run's mean over its nodes and steps is one sample; their mean may be off by 4.5 of its standard deviations.
     """
     nees: dict[str, list[float]] = {}
     for seed in range(RUNS):
