@@ -14,6 +14,7 @@ from pathlib import Path
 from zfusion import keys
 from zfusion.drivers.account import Account, MakeMethod, make_node, truth_message
 from zfusion.drivers.agenda import Action, Agenda
+from zfusion.drivers.designs import content_of
 from zfusion.drivers.meters import MARKED_EVERY
 from zfusion.drivers.metrics import NodeReport
 from zfusion.drivers.sources import Source, open_sources
@@ -475,6 +476,7 @@ def simulate(
         method=method,
         seed=scenario.seed,
         stages=chosen(scenario).stages,
+        design=content_of(scenario),
         facts={"world": "simulated"},
     ) as writer:
         simulation = Simulation(scenario, run=run, link=link, record=writer.write, sources=sources, observe=observe)

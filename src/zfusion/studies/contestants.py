@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from zfusion.drivers.designs import with_design
+from zfusion.drivers.designs import handed_on, with_design
 from zfusion.drivers.rerun import on_recording, read_recorded
 from zfusion.drivers.simulated import Simulation
 from zfusion.errors import InputError, ZfusionError
@@ -68,7 +68,8 @@ def field_of_recording(
 
     InputError also where the truth is not on it.
     """
-    scenario = on_recording(recording).with_overrides(**(overrides or {}))
+    recorded = on_recording(recording)
+    scenario = handed_on(recorded, recorded.with_overrides(**(overrides or {})))
     truths = read_recorded(recording, scenario).truths
     if not truths:
         raise InputError(f"{recording.path}: the true state is not on it: there is nothing to set estimates beside")
@@ -86,11 +87,11 @@ def _contestant(scenario: Scenario, label: str, design: Path) -> Contestant:
         raise UnknownMethodError(f"--methods: expected some of {', '.join(METHODS)} (is {name!r})")
     if settings:
         changed = {"name": name, "options": parse_settings(settings, "--methods")}
-        scenario = with_settings(scenario, {"method": changed}, label)
+        wanted = with_settings(scenario, {"method": changed}, label)
     else:
-        scenario = scenario.with_overrides(method=name)
-        check_method(scenario, label)
-    scenario = _ready(scenario, design)
+        wanted = scenario.with_overrides(method=name)
+        check_method(wanted, label)
+    scenario = _ready(handed_on(scenario, wanted), design)
     ideal = _without_links(scenario)
     return Contestant(label, scenario, None if ideal is None else _ready(ideal, design.with_suffix(".ideal.npz")))
 
