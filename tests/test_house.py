@@ -44,7 +44,7 @@ ONLY = {
 }
 """Packages, and the only places that import them."""
 
-ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player"}
+ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player", "observer"}
 
 NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py", "links/")
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import gc
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
 
@@ -30,7 +30,7 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, open_session, publisher
+from zfusion.drivers.transport import RECEIPT, never_linger, open_session, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
@@ -39,10 +39,13 @@ from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
-from zfusion.status import Phase, Status
+from zfusion.status import Counts, Phase, Status
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
+
+LINGERLESS_NS = 1_000_000_000
+"""How often a node sees to the links that it was not told of; shorter than their lease."""
 
 AHEAD = 65_536
 """Messages kept here that are too far ahead for the node to take: what a swarm says in half a minute, while a node that
@@ -102,7 +105,7 @@ class LiveNode:
         self._stamped = False
         """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
-        self._told_ns = 0
+        self._told_ns = self._lingerless_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
@@ -159,8 +162,8 @@ class LiveNode:
         self.stopping = True
         self._inbox.notify(None)
 
-    def status(self) -> Status:
-        """How the node is doing."""
+    def status(self, *, counted: bool = False) -> Status:
+        """How the node is doing; what it has `counted` where that is wanted."""
         node, meeting = self.node, self._meeting
         return Status(
             node=self.id,
@@ -174,6 +177,7 @@ class LiveNode:
             fallbacks=node.fallbacks if node else 0,
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
+            counts=self._counts() if counted else None,
         )
 
     def report(self) -> NodeReport:
@@ -185,14 +189,31 @@ class LiveNode:
         for *_, heard in self._ahead:
             refused = report.edges[str(heard.message.node)]["refused"]
             refused["too_early"] = refused.get("too_early", 0) + 1
-        report.overheard = dict(Counter(report.overheard) + self._presence.overheard)
-        if self._inbox.overrun:
-            report.overheard["overrun"] = self._inbox.overrun
-        report.clocks = {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
-        report.queues = {"ahead": self._most_ahead, "held": self._hearing.most_held}
+        report.overheard = self._overheard(report.overheard)
+        report.clocks = self._clocks()
+        report.queues = self._queues()
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
         return report
+
+    def _counts(self) -> Counts | None:
+        """What was counted so far; None before the first step."""
+        if self._account is None:
+            return None
+        counts = self._account.counts()
+        return replace(
+            counts, overheard=self._overheard(counts.overheard), clocks=self._clocks(), queues=self._queues()
+        )
+
+    def _overheard(self, by_source: Mapping[str, int]) -> dict[str, int]:
+        total = Counter(by_source) + self._presence.overheard
+        return {**total, "overrun": self._inbox.overrun} if self._inbox.overrun else dict(total)
+
+    def _clocks(self) -> dict[str, dict[str, float]]:
+        return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+
+    def _queues(self) -> dict[str, int]:
+        return {"ahead": self._most_ahead, "held": self._hearing.most_held}
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
         """The source of the readings that a program of the user's publishes."""
@@ -421,6 +442,9 @@ class LiveNode:
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
         self._told_ns = self._now()
+        if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
+            self._lingerless_ns = self._told_ns
+            never_linger()  # observers have links, too, and show no token
         self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())

@@ -1,0 +1,275 @@
+"""Looking at a running swarm from outside: who is there, what they say, and that nobody waits for who looks."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+from swarms import (
+    EXAMPLE,
+    Command,
+    client,
+    endpoints,
+    estimates,
+    launch,
+    process_of,
+    recorded,
+    run_name,
+    variant,
+    wait_until,
+    zfusion,
+)
+from zfusion.drivers import registry
+from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.observer import Observer, find_swarm
+from zfusion.drivers.transport import open_session
+from zfusion.errors import InputError
+from zfusion.report.swarm_table import seen_swarm
+from zfusion.swarm.launch import free_endpoints
+
+NODES = ("1", "2", "3", "4")
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("observed")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A registry of these tests' own: other runs of this machine are none of theirs."""
+    path = tmp_path_factory.mktemp("runtime")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(path))
+        yield path
+
+
+@pytest.fixture(scope="module")
+def run(directory: Path) -> Iterator[str]:
+    """A paced swarm of the example that goes on for as long as it is looked at, and its recorder."""
+    scenario, run = variant(directory, "observed", timing={"rate_hz": 20.0}), run_name("observed")
+    command = Command(directory, "launch", scenario, "--json", "--run", run, "--steps", 1_000_000)
+    with Observer(_swarm(run)) as observer:
+        wait_until(lambda: _looked(observer, "running"), "all nodes are running")
+    yield run
+    command.interrupt()
+    assert command.wait().summary["failures"] == []
+
+
+def _swarm(run: str) -> Any:
+    wait_until(lambda: [entry for entry in registry.entries() if entry.run == run], f"{run} is in the registry")
+    return find_swarm(run=run)
+
+
+def _looked(observer: Observer, *states: str) -> bool:
+    observer.ask()
+    return all(node.state in states for node in observer.nodes.values())
+
+
+def _state(observer: Observer, name: str) -> str:
+    observer.ask()
+    return observer.nodes[name].state
+
+
+def test_status_tells_of_every_node_and_of_the_recorder(run: str, directory: Path) -> None:
+    result = zfusion(directory, "status", "--json")  # the only run on this machine
+    told = result.summary
+    assert result.code == 0
+    assert told["run"] == run
+    assert list(told["nodes"]) == list(NODES)
+    for name, node in told["nodes"].items():
+        assert node["state"] == "running"
+        assert node["completed"] > 0
+        assert node["step"] >= node["completed"]
+        assert node["sent"]["estimate"] >= node["completed"]
+        assert name not in node["edges"]
+        assert node["received"] == sum(n for edge in node["edges"].values() for n in edge["received"].values()) > 0
+        assert len(node["estimate"]["x"]) == 1
+        assert node["rate_hz"] > 0
+    assert told["recorder"]["state"] == "recording"
+    assert told["recorder"]["messages"] > 0
+    assert told["recorder"]["path"].endswith(f"{run}.mcap")
+    assert told["missing"] == []
+
+
+def test_tables_fit_into_eighty_columns(run: str, directory: Path) -> None:
+    command = [sys.executable, "-m", "zfusion", "top", "--once", "--interval", "0.2"]
+    environment = {**os.environ, "COLUMNS": "80"}
+    lines = subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, check=True, timeout=60
+    ).stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(line.split()[:2] == [name, "running"] for line in lines) for name in NODES)
+
+
+def test_echo_prints_messages(run: str, directory: Path) -> None:
+    lines = zfusion(directory, "echo", "1/estimate", "--count", 3, "--json").out.splitlines()
+    letters = [json.loads(line) for line in lines]
+    assert [letter["key"] for letter in letters] == [f"zfusion/{run}/node/1/estimate"] * 3
+    first = letters[0]["message"]["seq"]
+    assert [letter["message"]["seq"] for letter in letters] == [first, first + 1, first + 2]
+    text = zfusion(directory, "echo", "estimate", "--count", 1).out
+    assert "step" in text
+    assert "  P " in text
+    key, size, data = zfusion(directory, "echo", f"zfusion/{run}/node/2/measurement", "--count", 1, "--raw").out.split()
+    assert (key, len(bytes.fromhex(data))) == (f"zfusion/{run}/node/2/measurement", int(size))
+    assert msgpack.unpackb(bytes.fromhex(data))["node"] == 2
+
+
+def test_hz_measures_every_key(run: str, directory: Path) -> None:
+    told = zfusion(directory, "hz", "measurement", "--once", "--json", "--interval", 2).summary
+    assert set(told["keys"]) == {f"zfusion/{run}/node/{name}/measurement" for name in NODES}
+    for rhythm in told["keys"].values():
+        assert rhythm["messages"] > 5
+        assert rhythm["lost"] == rhythm["unreadable"] == 0
+        assert rhythm["min_s"] <= rhythm["mean_s"] <= rhythm["max_s"]
+        assert rhythm["rate_hz"] * rhythm["mean_s"] == pytest.approx(1)
+    assert zfusion(directory, "hz", "nothing", "--once", "--json").code == 1
+
+
+def test_what_is_broken_is_shown_as_that(directory: Path) -> None:
+    good = msgpack.packb({"v": 1, "node": 3, "step": 1, "t_ns": 0, "seq": 0, "born": 1, "x": [float("nan")]})
+    payloads = {
+        b"\xc1": "not_msgpack",
+        b"\x1b[2J\x1b]0;owned\x07": "not_msgpack",
+        b"\x81" * 3000: "not_msgpack",
+        msgpack.packb([1]): "not_a_map",
+        msgpack.packb({"v": 1, "node": 3}): "missing_field",
+        msgpack.packb({"a": {"b": {"c": {"d": {"e": {"f": {"g": {"h": {"i": 1}}}}}}}}}): "too_deep",
+        good: "wrong_node",
+        bytes(2 << 20): "too_large",
+    }
+    [endpoint] = free_endpoints(1)
+    key = "zfusion/forged/node/9/event"
+    with open_session(Endpoints(listen=(endpoint,))) as session:
+        publisher = session.declare_publisher(key)
+        where = ("--connect", endpoint, "--run", "forged", "--count", len(payloads))
+        as_json, as_text = (Command(directory, "echo", "event", *where, *more) for more in (["--json"], []))
+        hz = Command(directory, "hz", "/my/key", "--connect", endpoint, "--once", "--json", "--interval", 0.2)
+        wait_until(lambda: publisher.matching_status.matching, "somebody listens")
+        while as_json.process.poll() is None or as_text.process.poll() is None or hz.process.poll() is None:
+            for payload in payloads:
+                publisher.put(payload)
+            session.put("my/key", b"21.5")
+            time.sleep(0.05)
+    letters = [json.loads(line) for line in as_json.wait().out.splitlines()]
+    assert {letter["error"] for letter in letters} == set(payloads.values())
+    text = as_text.wait().out
+    assert text.count("broken") == len(payloads)
+    assert "\x1b" not in text
+    assert list(hz.wait().summary["keys"]) == ["my/key"]
+
+
+def test_nodes_that_die_are_missing(directory: Path) -> None:
+    scenario, run = variant(directory, "dying", timing={"rate_hz": 20.0}), run_name("dying")
+    command = Command(directory, "launch", scenario, "--json", "--no-record", "--run", run, "--steps", 1_000_000)
+    with Observer(_swarm(run)) as observer:
+        wait_until(lambda: _looked(observer, "running"), "all nodes are running")
+        os.kill(process_of(run, "--id", "2"), signal.SIGSTOP)
+        wait_until(lambda: _state(observer, "2") in {"silent", "gone"}, "node 2 does not answer")
+        wait_until(lambda: _state(observer, "2") == "gone", "its lease is over")
+        os.kill(process_of(run, "--id", "2"), signal.SIGCONT)
+        wait_until(lambda: _state(observer, "2") == "running", "it is back")
+        os.kill(process_of(run, "--id", "3"), signal.SIGKILL)
+        wait_until(lambda: _state(observer, "3") == "gone", "node 3 is gone")
+        assert seen_swarm(observer)["nodes"]["3"]["completed"] > 0  # the last that was heard of it
+    result = zfusion(directory, "status", "--run", run, "--json")
+    assert (result.code, result.summary["missing"]) == (1, ["node 3"])
+    command.interrupt()
+    assert command.wait().code == 1
+    assert run not in {entry.run for entry in registry.entries()}
+
+
+def test_several_runs_are_told_apart(run: str, directory: Path) -> None:
+    other = registry.Entry("other", "observed", "other.toml", {"1": "tcp/127.0.0.1:1"})
+    with registry.registered(other):
+        assert f"other, {run}" in zfusion(directory, "status").error
+        assert zfusion(directory, "status", "--run", run, "--json").code == 0
+        assert zfusion(directory, "status", "--run", "third").code == 2
+        with pytest.raises(InputError, match="--run"):
+            find_swarm(directory / "observed.toml")
+    assert [entry.run for entry in registry.entries()] == [run]
+
+
+def test_notes_of_processes_that_are_gone_are_removed(_own_registry: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    directory = _own_registry / "zfusion"
+    stale = registry.Entry("stale", "s", "s.toml", {}, pid=ended.pid, birth="somebody/1")
+    another = registry.Entry("another", "s", "s.toml", {}, birth="somebody/1")  # a process of our id, another time
+    with registry.registered(stale), registry.registered(another):
+        assert len(list(directory.glob("*.json"))) >= 2
+        assert not {"stale", "another"} & {entry.run for entry in registry.entries()}
+        assert not list(directory.glob("stale*")) + list(directory.glob("another*"))
+
+
+def test_a_registry_that_others_can_write_to_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "zfusion").mkdir()
+    (tmp_path / "zfusion").chmod(0o777)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with registry.registered(registry.Entry("run", "s", "s.toml", {})):
+        assert not list((tmp_path / "zfusion").iterdir())
+        assert registry.entries() == []
+
+
+def test_nobody_is_there(directory: Path) -> None:
+    [endpoint] = free_endpoints(1)
+    assert "nobody is there" in zfusion(directory, "status", "--connect", endpoint).error
+
+
+def test_top_on_a_terminal_ends_with_q(run: str, directory: Path) -> None:
+    terminal, child = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "zfusion", "top", "--interval", "0.2"],
+        cwd=directory,
+        stdin=child,
+        stdout=child,
+        stderr=child,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "80", "LINES": "24"},
+    )
+    os.close(child)
+    shown = b""
+    while shown.count(b"running") < 12:
+        shown += os.read(terminal, 4096)
+    os.write(terminal, b"q")
+    with suppress(OSError):  # the end of the terminal's other side
+        while os.read(terminal, 4096):
+            pass
+    assert process.wait(60) == 0
+    os.close(terminal)
+
+
+def test_an_observer_that_stands_still_holds_nobody_up_beyond_its_lease(directory: Path) -> None:
+    """A free-running swarm fills its links within the lease; without the observer's it would go on undisturbed."""
+    scenario, run = variant(directory, "stopped"), run_name("stopped")
+    words = ("--free-run", "--no-record", "--json", "--run", run, "--steps", 10_000_000)
+    command = Command(directory, "launch", scenario, *words)
+    with Observer(_swarm(run)) as observer:
+        wait_until(lambda: _looked(observer, "running"), "all nodes are running")
+        listening = Command(directory, "echo", "**", "--run", run, "--json")
+        wait_until(lambda: listening.heard, "it hears something")
+        listening.process.send_signal(signal.SIGSTOP)
+        before = observer.nodes["1"].status.completed
+        began = time.monotonic()
+        longest, last = 0.0, (began, before)
+        while time.monotonic() < began + 6:
+            observer.ask()
+            now, completed = time.monotonic(), observer.nodes["1"].status.completed
+            if completed > last[1]:
+                longest, last = max(longest, now - last[0]), (now, completed)
+        print("longest", longest, "rounds", last[1] - before)
+        listening.process.kill()
+    command.interrupt()
+    print(command.wait())
