@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
+import tomli_w
 
 from swarms import (
     EXAMPLE,
@@ -34,8 +36,10 @@ from swarms import (
 from zfusion.drivers import registry
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.observer import Observer, find_swarm
-from zfusion.drivers.transport import open_session
+from zfusion.drivers.simulated import simulate
+from zfusion.drivers.transport import LEASE_MS, open_session, publisher
 from zfusion.errors import InputError
+from zfusion.model.scenario import load_scenario
 from zfusion.report.swarm_table import seen_swarm
 from zfusion.swarm.launch import free_endpoints
 
@@ -154,14 +158,14 @@ def test_what_is_broken_is_shown_as_that(directory: Path) -> None:
     [endpoint] = free_endpoints(1)
     key = "zfusion/forged/node/9/event"
     with open_session(Endpoints(listen=(endpoint,))) as session:
-        publisher = session.declare_publisher(key)
+        forger = publisher(session, key)
         where = ("--connect", endpoint, "--run", "forged", "--count", len(payloads))
         as_json, as_text = (Command(directory, "echo", "event", *where, *more) for more in (["--json"], []))
         hz = Command(directory, "hz", "/my/key", "--connect", endpoint, "--once", "--json", "--interval", 0.2)
-        wait_until(lambda: publisher.matching_status.matching, "somebody listens")
+        wait_until(lambda: forger.matching_status.matching, "somebody listens")
         while as_json.process.poll() is None or as_text.process.poll() is None or hz.process.poll() is None:
             for payload in payloads:
-                publisher.put(payload)
+                forger.put(payload)
             session.put("my/key", b"21.5")
             time.sleep(0.05)
     letters = [json.loads(line) for line in as_json.wait().out.splitlines()]
@@ -252,24 +256,52 @@ def test_top_on_a_terminal_ends_with_q(run: str, directory: Path) -> None:
 
 
 def test_an_observer_that_stands_still_holds_nobody_up_beyond_its_lease(directory: Path) -> None:
-    """A free-running swarm fills its links within the lease; without the observer's it would go on undisturbed."""
-    scenario, run = variant(directory, "stopped"), run_name("stopped")
-    words = ("--free-run", "--no-record", "--json", "--run", run, "--steps", 10_000_000)
-    command = Command(directory, "launch", scenario, *words)
+    """Messages of 37 kB, fifty a second: the links to the observer are full before its lease is over."""
+    nx, rate = 64, 50
+    system = {"F": np.eye(nx).tolist(), "Q": np.eye(nx).tolist(), "initial_mean": [0.0] * nx}
+    system |= {"initial_covariance": np.eye(nx).tolist()}
+    sensors = [{"id": i, "H": [[1.0] + [0.0] * (nx - 1)], "R": 1.0} for i in (1, 2)]
+    document = {"steps": 1, "method": "local", "timing": {"rate_hz": rate}, "system": system, "sensors": sensors}
+    path, run = directory / "large.toml", run_name("stopped")
+    path.write_text(tomli_w.dumps({"name": "large", **document, "network": {"generator": "complete"}}))
+    command = Command(directory, "launch", path, "--json", "--no-record", "--run", run, "--steps", 1_000_000)
     with Observer(_swarm(run)) as observer:
         wait_until(lambda: _looked(observer, "running"), "all nodes are running")
-        listening = Command(directory, "echo", "**", "--run", run, "--json")
-        wait_until(lambda: listening.heard, "it hears something")
-        listening.process.send_signal(signal.SIGSTOP)
-        before = observer.nodes["1"].status.completed
-        began = time.monotonic()
-        longest, last = 0.0, (began, before)
-        while time.monotonic() < began + 6:
-            observer.ask()
-            now, completed = time.monotonic(), observer.nodes["1"].status.completed
-            if completed > last[1]:
-                longest, last = max(longest, now - last[0]), (now, completed)
-        print("longest", longest, "rounds", last[1] - before)
-        listening.process.kill()
+        still = Command(directory, "echo", "**", "--run", run, "--json")
+        wait_until(lambda: still.heard, "it hears something")
+        before = {name: (_steps(observer, name)) for name in observer.nodes}
+        still.process.send_signal(signal.SIGSTOP)
+        standing = time.monotonic() + 3 * LEASE_MS / 1e3
+        wait_until(lambda: time.monotonic() > standing, "its lease is over")
+        later = time.monotonic()
+        print({name: [a - b for a, b in zip(_steps(observer, name), before[name])] for name in observer.nodes})
+        still.process.kill()
+        still.process.wait()
     command.interrupt()
-    print(command.wait())
+    print(command.wait().summary["skipped"])
+
+
+def _steps(observer: Observer, name: str) -> tuple[int, int]:
+    """Steps that a node has completed, and skipped."""
+    observer.ask()
+    status = observer.nodes[name].status
+    assert status is not None
+    assert status.counts is not None
+    return status.completed, status.counts.skipped
+
+
+def test_estimates_are_the_same_to_the_bit_whoever_looks(directory: Path) -> None:
+    """A free-running swarm uses all messages, so that its estimates can be told beforehand."""
+    scenario, run = variant(directory, "looked-at", timing={"timeout_s": 60.0}), run_name("looked-at")
+    steps = 1500
+    command = Command(directory, "launch", scenario, "--free-run", "--json", "--run", run, "--steps", steps)
+    heard = 0
+    with Observer(_swarm(run)) as observer:
+        ring = observer.listen(f"zfusion/{run}/**")
+        while command.process.poll() is None:
+            observer.ask()
+            heard += sum(1 for _ in ring.take(0.01))
+    assert command.wait().summary["completed_steps"] == dict.fromkeys(NODES, steps)
+    assert heard > 100
+    simulate(load_scenario(scenario, free_run=True, steps=steps), run=run, output=directory / "expected.mcap")
+    assert estimates(directory / "recordings" / f"{run}.mcap") == estimates(directory / "expected.mcap")

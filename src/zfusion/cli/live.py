@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from zfusion.cli import logs
 from zfusion.cli.common import (
     Connect,
     ControlFd,
@@ -94,10 +95,11 @@ def launched(
     from zfusion.swarm.launch import Launcher, LaunchOptions
 
     directory = recording.parent if recording is not None else default_directory(scenario)
-    logs = directory / f"{run}.logs"
+    logs.about(run)
     design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
-        options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
+        say = logs.log.warning if logs.as_json() else table.message
+        options = LaunchOptions(run, directory / f"{run}.logs", recording, restart, netns, table.update, say)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -192,7 +194,9 @@ def node(
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
             control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
 
+        logs.about(options.run, own)
         live = LiveNode(loaded, own, options, tell, None if control is None else announce)
+        logs.about(options.run, own, lambda: None if live.node is None else live.node.step)
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
@@ -223,6 +227,7 @@ def record(
     with ToldTo(control):
         loaded = load_scenario(scenario)
         name = given_run(run, loaded)
+        logs.about(name)
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(

@@ -10,6 +10,7 @@ Everything happens on one thread. Zenoh's callbacks only leave notices, which ar
 from __future__ import annotations
 
 import gc
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -20,6 +21,7 @@ from itertools import count
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.complaints import Complaints
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
@@ -36,10 +38,12 @@ from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
-from zfusion.model.types import NodeId
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
 from zfusion.status import Counts, Phase, Status
+
+log = logging.getLogger(__name__)
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
@@ -110,6 +114,7 @@ class LiveNode:
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
         """Whether a paced step begins late, if it has to, rather than not at all."""
+        self._complaints = Complaints()
         self._misfortune = Misfortune(scenario, node, announce)
         link = links_of(scenario) if options.emulate else ideal
         config = scenario.transport.zenoh_config
@@ -252,6 +257,7 @@ class LiveNode:
         self.node, self.phase = node, Phase.RUNNING
         self._account = Account(node, self._source, first, stages=exchanged, marked_every=every)
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
+        log.info("begins with step %d, expecting %s", start.born, ", ".join(map(str, sorted_ids(start.expected))))
         self.tell_status()
         return node
 
@@ -431,6 +437,7 @@ class LiveNode:
         node = self.node
         if node is None:
             return
+        log.warning("node %s is gone", j)
         self._hearing.drain(j)
         heard = [self._last_heard[channel] for channel in self._hearing.channels(j) if channel in self._last_heard]
         last = [decode_any(data) for data in (*heard, *self._hearing.held(j)[:MOST_HELD])]
@@ -444,10 +451,18 @@ class LiveNode:
         self._told_ns = self._now()
         if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
             self._lingerless_ns = self._told_ns
+            self._complain()
             never_linger()  # observers have links, too, and show no token
         self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())
+
+    def _complain(self, *, ended: bool = False) -> None:
+        """Log what was refused."""
+        if self.node is not None and self._account is not None:
+            refused: dict[str, Mapping[str, int]] = {f"node {j}": c.refused for j, c in self.node.counters.items()}
+            refused["elsewhere"] = self._overheard(self._source.counters)
+            self._complaints.look(self._now(), refused, ended=ended)
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""
@@ -458,3 +473,5 @@ class LiveNode:
         self.tell_status()
         self._presence.take_leave()
         self._hearing.end()
+        self._complain(ended=True)
+        log.info("ends: %d steps completed, %d skipped", node.completed, self._account.skipped)

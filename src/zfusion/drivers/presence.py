@@ -242,12 +242,14 @@ class Presence:
                 self._host.part_with(j)
             return
         never_linger()  # there may be a new link
+        log.info("node %s is there", j)
         self.meeting.came(j)
         if self._host.node is not None:
             self._ask_status(j)
 
     def _on_recorder(self, sample: Any, _at_ns: int) -> None:
         self.meeting.recorder = sample.kind == zenoh.SampleKind.PUT
+        log.info("the recorder is %s", "there" if self.meeting.recorder else "gone")
         if not self.meeting.recorder:
             self._unconfirmed.discard(RECORDER)
 

@@ -6,6 +6,7 @@ all that was published before it has arrived, so that nodes leave only when it h
 
 from __future__ import annotations
 
+import logging
 import platform
 import time
 from collections import defaultdict
@@ -29,6 +30,8 @@ from zfusion.model.types import NodeId
 from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, TRUTH_SENDER, Stage
 from zfusion.status import RecorderStatus
+
+log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
@@ -244,13 +247,16 @@ class Recorder:
             never_linger()  # there is a new link
             self._seen.add(node)
             self._present.add(node)
+            log.info("node %s is there", node)
         else:
             self._present.discard(node)
+            log.info("node %s is gone", node)
 
     def _finish(self) -> None:
         self._count()
         accounts = self._writer.finish(sent=self._sent, facts={"foreign": str(self._report.foreign)})
         self._report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
+        log.info("%d messages in %s", self._report.messages, self._report.path)
 
 
 def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:
