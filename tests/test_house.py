@@ -38,6 +38,8 @@ ONLY = {
     "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
     "pydantic": ("model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
+    "prometheus_client": ("report/exporters.py",),
+    "opentelemetry": ("report/exporters.py",),
     "distributed": ("studies/experiment/engines.py",),
     "cvxpy": ("methods/convex.py",),
     "scipy": ("methods/convex.py",),

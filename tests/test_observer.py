@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +23,14 @@ import msgpack
 import numpy as np
 import pytest
 import tomli_w
+from opentelemetry.proto.collector.metrics.v1.metrics_service_pb2 import ExportMetricsServiceRequest
+from prometheus_client.parser import text_string_to_metric_families
 
 from swarms import (
-    EXAMPLE,
+    PATIENCE_S,
     Command,
-    client,
-    endpoints,
     estimates,
-    launch,
     process_of,
-    recorded,
     run_name,
     variant,
     wait_until,
@@ -52,7 +55,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _own_registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def own_registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A registry of these tests' own: other runs of this machine are none of theirs."""
     path = tmp_path_factory.mktemp("runtime")
     with pytest.MonkeyPatch.context() as patch:
@@ -143,6 +146,53 @@ def test_hz_measures_every_key(run: str, directory: Path) -> None:
     assert zfusion(directory, "hz", "nothing", "--once", "--json").code == 1
 
 
+def test_metrics_are_served_and_pushed(run: str, directory: Path) -> None:
+    pushed: list[bytes] = []
+
+    class Collector(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            pushed.append(gzip.decompress(body) if self.headers.get("Content-Encoding") == "gzip" else body)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Collector) as collector:
+        thread = threading.Thread(target=collector.serve_forever)
+        thread.start()
+        otlp = f"http://127.0.0.1:{collector.server_port}/v1/metrics"
+        command = Command(directory, "metrics", "--run", run, "--port", 0, "--otlp", otlp, "--interval", 0.2)
+        wait_until(lambda: "http://" in command.said(), "it serves")
+        url = re.search(r"http://\S+", command.said())
+        assert url
+        first, second = _scraped(url[0]), {}
+        steps = ("zfusion_node_steps_total", ("node", "1"), ("run", run))
+        wait_until(lambda: second.update(_scraped(url[0])) or second[steps] > first[steps], "steps are counted")
+        wait_until(lambda: pushed, "metrics are pushed")
+        command.interrupt()
+        assert command.wait().code == 0
+        collector.shutdown()
+        thread.join()
+    edge = (("from", "2"), ("node", "1"), ("run", run), ("stage", "measurement"))
+    assert second["zfusion_messages_received_total", *edge] > 0
+    assert second["zfusion_messages_lost_total", *edge] == 0
+    assert second["zfusion_recorder_messages_total", ("run", run)] > 0
+    wait = (("node", "1"), ("run", run), ("stage", "intermediate"))
+    count = second["zfusion_stage_wait_seconds_count", *wait]
+    assert 0 < second["zfusion_stage_wait_seconds_sum", *wait] < count
+    assert second["zfusion_stage_wait_seconds_bucket", ("le", "+Inf"), *wait] == count
+    told = ExportMetricsServiceRequest.FromString(pushed[0]).resource_metrics[0].scope_metrics[0].metrics
+    assert "zfusion_node_steps" in {metric.name for metric in told}
+
+
+def _scraped(url: str) -> dict[tuple[Any, ...], float]:
+    with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
+        families = text_string_to_metric_families(answer.read().decode())
+        return {(s.name, *sorted(s.labels.items())): s.value for family in families for s in family.samples}
+
+
 def test_what_is_broken_is_shown_as_that(directory: Path) -> None:
     good = msgpack.packb({"v": 1, "node": 3, "step": 1, "t_ns": 0, "seq": 0, "born": 1, "x": [float("nan")]})
     payloads = {
@@ -207,10 +257,10 @@ def test_several_runs_are_told_apart(run: str, directory: Path) -> None:
     assert [entry.run for entry in registry.entries()] == [run]
 
 
-def test_notes_of_processes_that_are_gone_are_removed(_own_registry: Path) -> None:
+def test_notes_of_processes_that_are_gone_are_removed(own_registry: Path) -> None:
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    directory = _own_registry / "zfusion"
+    directory = own_registry / "zfusion"
     stale = registry.Entry("stale", "s", "s.toml", {}, pid=ended.pid, birth="somebody/1")
     another = registry.Entry("another", "s", "s.toml", {}, birth="somebody/1")  # a process of our id, another time
     with registry.registered(stale), registry.registered(another):
@@ -269,38 +319,38 @@ def test_an_observer_that_stands_still_holds_nobody_up_beyond_its_lease(director
         wait_until(lambda: _looked(observer, "running"), "all nodes are running")
         still = Command(directory, "echo", "**", "--run", run, "--json")
         wait_until(lambda: still.heard, "it hears something")
-        before = {name: (_steps(observer, name)) for name in observer.nodes}
+        before = {name: _steps(observer, name) for name in observer.nodes}
         still.process.send_signal(signal.SIGSTOP)
         standing = time.monotonic() + 3 * LEASE_MS / 1e3
         wait_until(lambda: time.monotonic() > standing, "its lease is over")
-        later = time.monotonic()
-        print({name: [a - b for a, b in zip(_steps(observer, name), before[name])] for name in observer.nodes})
+        made = {name: _steps(observer, name) - before[name] for name in observer.nodes}
         still.process.kill()
         still.process.wait()
     command.interrupt()
-    print(command.wait().summary["skipped"])
+    assert command.wait().code == 0
+    # Two of the three leases at least were theirs; a closing link that lingers takes ten seconds.
+    assert min(made.values()) > 0
 
 
-def _steps(observer: Observer, name: str) -> tuple[int, int]:
-    """Steps that a node has completed, and skipped."""
+def _steps(observer: Observer, name: str) -> int:
+    """Steps that a node has completed."""
     observer.ask()
     status = observer.nodes[name].status
     assert status is not None
-    assert status.counts is not None
-    return status.completed, status.counts.skipped
+    return status.completed
 
 
 def test_estimates_are_the_same_to_the_bit_whoever_looks(directory: Path) -> None:
     """A free-running swarm uses all messages, so that its estimates can be told beforehand."""
     scenario, run = variant(directory, "looked-at", timing={"timeout_s": 60.0}), run_name("looked-at")
-    steps = 1500
+    steps = 400
     command = Command(directory, "launch", scenario, "--free-run", "--json", "--run", run, "--steps", steps)
     heard = 0
     with Observer(_swarm(run)) as observer:
         ring = observer.listen(f"zfusion/{run}/**")
         while command.process.poll() is None:
             observer.ask()
-            heard += sum(1 for _ in ring.take(0.01))
+            heard += sum(1 for _ in ring.take(0.1))
     assert command.wait().summary["completed_steps"] == dict.fromkeys(NODES, steps)
     assert heard > 100
     simulate(load_scenario(scenario, free_run=True, steps=steps), run=run, output=directory / "expected.mcap")

@@ -34,6 +34,7 @@ for command in (
     observe.top,
     observe.echo,
     observe.hz,
+    observe.metrics,
     models.design,
     compare.compare,
     compare.worst,

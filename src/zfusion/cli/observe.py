@@ -1,4 +1,4 @@
-"""Commands that look at a running swarm: status, top, echo, hz."""
+"""Commands that look at a running swarm: status, top, echo, hz, metrics."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -151,6 +152,37 @@ def hz(
         watch(measure, told, lambda: rhythm_table(rhythms, ring.dropped, out.width), quitting, 0.0, once, as_json)
     if not rhythms:
         raise typer.Exit(1)
+
+
+def metrics(
+    scenario: Observed = None,
+    run: ObservedRun = None,
+    connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
+    host: Annotated[str, typer.Option(help="Address to serve on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to serve on.", min=0, max=65535)] = 9464,
+    otlp: Annotated[
+        str | None, typer.Option("--otlp", help="Push to this OTLP collector (HTTP), too.", show_default=False)
+    ] = None,
+    interval: Annotated[float, typer.Option(help="Seconds from one question to the nodes to the next.", min=0.1)] = 5.0,
+) -> None:
+    """Serve a running swarm's metrics to Prometheus."""
+    from zfusion.drivers.observer import Observer
+    from zfusion.report.exporters import push, serve
+    from zfusion.report.metrics import families
+
+    swarm = reachable(scenario, run, connect, zenoh_config)
+    with Observer(swarm) as observer, Quitting() as quitting, ExitStack() as ends:
+        observer.settle()
+        seen = list(families(observer))
+        port, end = serve(lambda: seen, host, port)
+        ends.callback(end)
+        if otlp is not None:
+            ends.callback(push(lambda: seen, otlp, interval))
+        err.print(f"http://{host}:{port}/metrics", markup=False)
+        while not quitting.rest(interval):
+            observer.ask()
+            seen = list(families(observer))
 
 
 def take_in(ring: Ring, rhythms: dict[str, Rhythm], window: int) -> None:
