@@ -247,7 +247,7 @@ def test_nodes_that_die_are_missing(directory: Path) -> None:
 
 
 def test_several_runs_are_told_apart(run: str, directory: Path) -> None:
-    other = registry.Entry("other", "observed", "other.toml", {"1": "tcp/127.0.0.1:1"})
+    other = registry.Entry("other", "observed", {"1": "tcp/127.0.0.1:1"})
     with registry.registered(other):
         assert f"other, {run}" in zfusion(directory, "status").error
         assert zfusion(directory, "status", "--run", run, "--json").code == 0
@@ -261,8 +261,8 @@ def test_notes_of_processes_that_are_gone_are_removed(own_registry: Path) -> Non
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     directory = own_registry / "zfusion"
-    stale = registry.Entry("stale", "s", "s.toml", {}, pid=ended.pid, birth="somebody/1")
-    another = registry.Entry("another", "s", "s.toml", {}, birth="somebody/1")  # a process of our id, another time
+    stale = registry.Entry("stale", "s", {}, pid=ended.pid, birth="somebody/1")
+    another = registry.Entry("another", "s", {}, birth="somebody/1")  # a process of our id, another time
     with registry.registered(stale), registry.registered(another):
         assert len(list(directory.glob("*.json"))) >= 2
         assert not {"stale", "another"} & {entry.run for entry in registry.entries()}
@@ -273,7 +273,7 @@ def test_a_registry_that_others_can_write_to_is_not_used(tmp_path: Path, monkeyp
     (tmp_path / "zfusion").mkdir()
     (tmp_path / "zfusion").chmod(0o777)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with registry.registered(registry.Entry("run", "s", "s.toml", {})):
+    with registry.registered(registry.Entry("run", "s", {})):
         assert not list((tmp_path / "zfusion").iterdir())
         assert registry.entries() == []
 

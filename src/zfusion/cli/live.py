@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,6 +43,7 @@ from zfusion.cli.common import (
 from zfusion.cli.progress import design_first
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.model.types import NodeId
 
 NetnsKind = Literal["tun", "netem"]
 
@@ -200,7 +203,8 @@ def node(
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
-        report = asdict(live.run())
+        with noted(control, loaded, options.run, options.endpoints.listen, own):
+            report = asdict(live.run())
     if control is not None:
         control.tell(report=report)
         return
@@ -240,17 +244,41 @@ def record(
             facts=None if network is None else {"network": network},
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))
-        recorder = Recorder(
-            loaded, name, recorder_endpoints(loaded, connect, listen), writer, until_all_gone=control is None, tell=tell
-        )
+        endpoints = recorder_endpoints(loaded, connect, listen)
+        recorder = Recorder(loaded, name, endpoints, writer, until_all_gone=control is None, tell=tell)
         on_signals(recorder.stop)
         if control is not None:
             control.on_stop(recorder.stop)
-        report = asdict(recorder.run())
+        with noted(control, loaded, name, endpoints.listen):
+            report = asdict(recorder.run())
     if control is not None:
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+
+
+def noted(
+    control: Any, scenario: Scenario, run: str, listens: Sequence[str], node: NodeId | None = None
+) -> AbstractContextManager[None]:
+    """Have observers on this machine find a process that was started by hand: a node, or the recorder."""
+    from zfusion.drivers.endpoints import listens_at
+    from zfusion.drivers.registry import Entry, registered
+
+    if control is not None:  # the launcher does it for all
+        return nullcontext()
+    transport = scenario.transport
+    own = transport.zenoh_config if not listens else None
+    own_endpoint = {str(node): listens[0]} if node is not None and listens else {}
+    entry = Entry(
+        run=run,
+        scenario=scenario.name,
+        endpoints=own_endpoint,
+        elsewhere={} if own else {str(i): endpoint for i, endpoint in listens_at(scenario).items()},
+        recorder=listens[0] if node is None and listens else None,
+        low_latency=transport.preset == "lowlatency",
+        config=str(scenario.absolute(own)) if own else None,
+    )
+    return registered(entry)
 
 
 def network(

@@ -109,11 +109,12 @@ def find_swarm(
 
 
 def _noted(entry: registry.Entry) -> Swarm:
-    dialled = [*entry.endpoints.values(), *filter(None, [entry.recorder])]
+    nodes = {**entry.elsewhere, **entry.endpoints}
+    dialled = filter(None, [*nodes.values(), entry.recorder])
     return Swarm(
         entry.run,
         Endpoints(connect=() if entry.config else tuple(map(registry.dialled_here, dialled))),
-        tuple(entry.endpoints),
+        tuple(sorted(nodes, key=order)),
         entry.recorder is not None,
         entry.low_latency,
         None if entry.config is None else Path(entry.config),

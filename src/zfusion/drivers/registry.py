@@ -32,10 +32,10 @@ class Entry:
     run: str
     scenario: str
     """The scenario's name."""
-    file: str
-    """Where the scenario is."""
     endpoints: Mapping[str, str]
     """Node -> where it is dialled; empty where a Zenoh configuration of the user's says that."""
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
+    """The same of those that somebody else has started, as far as one knows."""
     recorder: str | None = None
     """Where the recorder is dialled; None where there is none, or none that listens."""
     low_latency: bool = False
@@ -75,8 +75,12 @@ def entries() -> list[Entry]:
         if entry is None:
             continue
         first = found.get(entry.run, entry)
-        merged = {**first.endpoints, **entry.endpoints}
-        found[entry.run] = replace(first, endpoints=merged, recorder=first.recorder or entry.recorder)
+        found[entry.run] = replace(
+            first,
+            endpoints={**first.endpoints, **entry.endpoints},
+            elsewhere={**first.elsewhere, **entry.elsewhere},
+            recorder=first.recorder or entry.recorder,
+        )
     return list(found.values())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -152,6 +153,6 @@ def _recorder_line(recorder: SeenRecorder) -> Text:
     line = Text("recorder: ").append(_state(recorder.state))
     if (status := recorder.status) is not None:
         line.append(f"   {status.messages} messages, {status.lost} lost, {status.foreign} foreign, ")
-        line.append(f"{status.waiting} waiting   {printable(status.path)}")
+        line.append(f"{status.waiting} waiting   {printable(Path(status.path).name)}")
     line.no_wrap, line.overflow = True, "ellipsis"
     return line

@@ -224,7 +224,6 @@ class Launcher:
         return Entry(
             run=self._options.run,
             scenario=self._scenario.name,
-            file=str(self._file),
             endpoints={str(i): endpoint for i, endpoint in self._dials.items()},
             recorder=self._recorder_listens if self._recorder is not None else None,
             low_latency=transport.preset == "lowlatency",
