@@ -38,6 +38,7 @@ ONLY = {
     "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
     "pydantic": ("model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
+    "psutil": ("swarm/watch.py",),
     "distributed": ("studies/experiment/engines.py",),
     "cvxpy": ("methods/convex.py",),
     "scipy": ("methods/convex.py",),

@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, models, recordings, report
+from zfusion.cli import compare, experiment, library, live, models, recordings, report, soak
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -40,6 +40,7 @@ for command in (
     recordings.info,
     recordings.export,
     report.report,
+    soak.soak,
 ):
     app.command()(command)
 app.command(hidden=True)(live.network)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -40,6 +41,12 @@ from zfusion.cli.common import (
 from zfusion.cli.progress import design_first
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.model.types import NodeId
+
+if TYPE_CHECKING:
+    from zfusion.swarm.launch import Child, Launcher
+
+    WatchedBy = Callable[[Launcher, Mapping[NodeId, Child], Child | None], None]
 
 NetnsKind = Literal["tun", "netem"]
 
@@ -87,17 +94,31 @@ def launched(
     restart: bool = False,
     netns: str | None = None,
     quiet: bool = False,
+    directory: Path | None = None,
+    watch: WatchedBy | None = None,
+    health_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Launch a swarm, show how it goes unless `quiet`, and summarise it."""
+    """Launch a swarm, show how it goes unless `quiet`, and summarise it.
+
+    The logs go to `directory`, by default where the recording does. `watch` is called about ten times a second with the
+    launcher and its processes, of which the nodes tell their health every `health_s`.
+    """
     from zfusion.report.summary import summarize
     from zfusion.report.table import LiveTable
     from zfusion.swarm.launch import Launcher, LaunchOptions
 
-    directory = recording.parent if recording is not None else default_directory(scenario)
+    if directory is None:
+        directory = recording.parent if recording is not None else default_directory(scenario)
     logs = directory / f"{run}.logs"
     design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
-        options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
+
+        def update(nodes: Mapping[NodeId, Child], recorder: Child | None) -> None:
+            table.update(nodes, recorder)
+            if watch is not None:
+                watch(launcher, nodes, recorder)
+
+        options = LaunchOptions(run, logs, recording, restart, netns, health_s, update, table.message)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -166,6 +187,7 @@ def node(
     emulation: Annotated[
         bool, typer.Option("--emulation/--no-emulation", help="Do to messages what the scenario's links say.")
     ] = True,
+    health: Annotated[float, typer.Option(hidden=True)] = 0.0,
     as_json: Json = False,
     control_fd: ControlFd = None,
 ) -> None:
@@ -185,6 +207,7 @@ def node(
             epoch_ns=None if epoch is None else epoch_ns(epoch),
             steps=None if forever else loaded.steps,
             emulate=emulation,
+            health_s=0.0 if control is None else health,
         )
         tell = None if control is None else lambda status: control.tell(status=plain(asdict(status)))
 
@@ -192,7 +215,11 @@ def node(
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
             control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
 
-        live = LiveNode(loaded, own, options, tell, None if control is None else announce)
+        def tell_health(told: Any) -> None:
+            """Tell the launcher, for whoever watches."""
+            control.tell(health=told)
+
+        live = LiveNode(loaded, own, options, tell, None if control is None else announce, tell_health)
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
