@@ -7,6 +7,7 @@ neighbours can go on after messages were lost; what they still do not know is a 
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -46,7 +47,7 @@ class History:
     born: int
     last: int = field(default=-1)
     """The last step of which anything is known; `born` - 1 where nothing is."""
-    _starts: list[int] = field(default_factory=list)
+    _starts: array[int] = field(default_factory=lambda: array("q"))
     _sets: list[UsedSet | None] = field(default_factory=list)
     """From each start to the next, or to `last`; None where it is not known. No two neighbours are equal."""
 

@@ -138,7 +138,7 @@ def _soaked(
     from zfusion.cli.live import launched
     from zfusion.methods import chosen
     from zfusion.report.soak_report import write_report
-    from zfusion.studies.soak.growth import judge, warm_up_s
+    from zfusion.studies.soak.growth import begun_s, judge, warm_up_s
     from zfusion.studies.soak.samples import read_samples
     from zfusion.swarm.watch import Watch
 
@@ -154,7 +154,8 @@ def _soaked(
     with err.status("drawing"):
         courses = read_samples(samples)
         elapsed_s = max((float(course.t_s[-1]) for course in courses), default=0.0)
-        not_judged_s = warm_up_s(elapsed_s) if warm_up is None else warm_up
+        began_s = begun_s(courses)
+        not_judged_s = began_s + (warm_up_s(elapsed_s - began_s) if warm_up is None else warm_up)
         growth = judge(courses, not_judged_s, period_ns / 1e9 if period_ns else None)
         told = {
             "run": run,

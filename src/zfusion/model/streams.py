@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from hashlib import sha256
+from itertools import islice
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -72,7 +73,7 @@ class Ends(Generic[T]):
         """What a block begins with is known."""
         self._known[block] = begins_with
         if len(self._known) > KEPT_ENDS:
-            del self._known[sorted(self._known)[1]]  # block 0 stays
+            del self._known[next(islice(self._known, 1, None))]  # the first that was noted; block 0 stays
 
 
 class Recent(Generic[T]):

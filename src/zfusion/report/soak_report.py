@@ -64,8 +64,8 @@ def _judged(told: Mapping[str, Any], growth: Sequence[Growth]) -> Section:
         worst += sorted(of_it, key=lambda g: (g.grows, g.per_hour.slope), reverse=True)[:1]
     text = (
         f"The first {_duration(told['warm_up_s'])} are not judged. A trend is the median of the slopes between all "
-        "pairs of samples (Theil, Sen), with its 95 % interval. A quantity grows where all of that interval lies above what "
-        "is tolerated, and what it rose by in the time that is judged is more than chance does."
+        "pairs of samples (Theil, Sen), with its 95 % interval. A quantity grows where all of that interval lies above "
+        "what is tolerated, and what it rose by in the time that is judged is more than chance does."
     )
     table = _growth_table(worst, "Of each quantity, the process in which it grew fastest.")
     return Section("verdict", "Does anything grow?", [text], [table] if worst else [])

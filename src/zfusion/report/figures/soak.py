@@ -54,7 +54,7 @@ def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
             for number, line in enumerate(panel.lines):
                 _draw(ax, line, style.COLOURS[number % len(style.COLOURS)], scale)
             ax.axvspan(0, warm_up_s / scale, color=style.GREY, alpha=0.10, linewidth=0)
-            ax.set_ylim(bottom=0)
+            ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
             ax.set_xlim(0, longest / scale)
             ax.set_ylabel(panel.y)
             ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -27,6 +27,9 @@ LEVEL_PART = 0.1
 
 SWARM = "swarm"
 
+LOAD_S = 300.0
+"""What depends on what else the machine does is judged from five minutes on."""
+
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
@@ -38,18 +41,20 @@ class Quantity:
     """Growth per hour that passes."""
     floor: float
     """Growth over the judged time that passes, however fast it was: less cannot be told from chance in a short run."""
+    least_s: float
+    """Time that must be judged: of less, nothing is said."""
     meaning: str
 
 
-MEMORY = Quantity("memory", "MiB", 2.0, 1.0, "that the process has for itself (USS)")
-DESCRIPTORS = Quantity("descriptors", "", 1.0, 2.0, "open files and sockets")
-THREADS = Quantity("threads", "", 1.0, 2.0, "")
-CPU = Quantity("cpu", "%", 5.0, 3.0, "of one processor")
-QUEUED = Quantity("queued", "messages", 10.0, 10.0, "in the node: ahead, held, posted and notices together")
-ROUND = Quantity("round", "% of the period", 10.0, 5.0, "from measurement to estimate, median")
-MISSED = Quantity("missed", "%", 2.0, 2.0, "of the messages: not there at the deadline")
-SKIPPED = Quantity("skipped", "%", 2.0, 2.0, "of the steps")
-LOGS = Quantity("logs", "MiB", 1.0, 0.25, "that all processes wrote")
+MEMORY = Quantity("memory", "MiB", 4.0, 4.0, 0.0, "that the process has for itself (USS)")
+DESCRIPTORS = Quantity("descriptors", "", 1.0, 2.0, 0.0, "open files and sockets")
+THREADS = Quantity("threads", "", 1.0, 2.0, 0.0, "of the process")
+CPU = Quantity("cpu", "%", 5.0, 3.0, LOAD_S, "of one processor")
+QUEUED = Quantity("queued", "messages", 10.0, 10.0, 0.0, "in the node: ahead, held, posted and notices together")
+ROUND = Quantity("round", "% of the period", 10.0, 5.0, LOAD_S, "from measurement to estimate, median")
+MISSED = Quantity("missed", "%", 2.0, 2.0, LOAD_S, "of the messages: not there at the deadline")
+SKIPPED = Quantity("skipped", "%", 2.0, 2.0, LOAD_S, "of the steps")
+LOGS = Quantity("logs", "MiB", 1.0, 0.25, 0.0, "that all processes wrote")
 
 QUANTITIES = (MEMORY, DESCRIPTORS, THREADS, CPU, QUEUED, ROUND, MISSED, SKIPPED, LOGS)
 
@@ -99,9 +104,21 @@ class Series:
     values: Array
 
 
-def warm_up_s(elapsed_s: float) -> float:
-    """How much of the beginning of a run is not judged, unless something else is said."""
-    return min(MOST_WARM_UP_S, WARM_UP_PART * elapsed_s)
+def begun_s(courses: Sequence[Course]) -> float:
+    """When all nodes were first seen to take steps; 0 where that was not seen of all."""
+    first: dict[str, float] = {}
+    for course in courses:
+        running = np.flatnonzero(course.columns["step"] > 0)
+        if course.kind == NODE and len(running):
+            at = float(course.t_s[running[0]])
+            first[course.process] = min(at, first.get(course.process, at))
+    nodes = {course.process for course in courses if course.kind == NODE}
+    return max(first.values()) if first and first.keys() == nodes else 0.0
+
+
+def warm_up_s(running_s: float) -> float:
+    """How much of the time that a swarm runs is not judged, unless something else is said."""
+    return min(MOST_WARM_UP_S, WARM_UP_PART * running_s)
 
 
 def judge(courses: Sequence[Course], after_s: float, period_s: float | None) -> list[Growth]:
@@ -109,8 +126,9 @@ def judge(courses: Sequence[Course], after_s: float, period_s: float | None) -> 
     found = []
     for series in all_series(courses, period_s):
         kept = (series.t_s >= after_s) & np.isfinite(series.values)
-        if kept.sum() >= FEWEST_SAMPLES:
-            found.append(_growth(series, series.t_s[kept], series.values[kept]))
+        t_s = series.t_s[kept]
+        if len(t_s) >= FEWEST_SAMPLES and t_s[-1] - t_s[0] >= series.quantity.least_s:
+            found.append(_growth(series, t_s, series.values[kept]))
     return found
 
 
