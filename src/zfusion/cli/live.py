@@ -241,6 +241,7 @@ def record(
     control_fd: ControlFd = None,
 ) -> None:
     """Record a run: the recorder alone, for swarms on many machines. Ends with Ctrl-C, or when all nodes have left."""
+    from zfusion.drivers.designs import content_of
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
@@ -259,6 +260,7 @@ def record(
             method=method,
             seed=loaded.seed,
             stages=chosen(loaded).stages,
+            design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
@@ -50,8 +50,8 @@ PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
 between our finding it free and the node's listening on it."""
 
-_tried = count(os.getpid() * 61)
-"""Two launchers begin at different places."""
+BLOCK = 200
+"""Ports that one process at a time takes from."""
 
 DESIGN = "design.npz"
 """Among the logs: what all nodes share, where the method is designed off-line and the scenario names no file."""
@@ -468,7 +468,7 @@ def free_endpoints(number: int) -> list[str]:
                 break
             sockets.append(socket.socket())
             try:
-                sockets[-1].bind(("127.0.0.1", PORTS[next(_tried) % len(PORTS)]))
+                sockets[-1].bind(("127.0.0.1", next(_ports)))
             except OSError:
                 sockets.pop().close()
         if len(sockets) < number:
@@ -477,6 +477,26 @@ def free_endpoints(number: int) -> list[str]:
     finally:
         for s in sockets:
             s.close()
+
+
+def _own_ports() -> Iterator[int]:
+    """Ports, without end, of blocks that no other process takes ports from meanwhile.
+
+    What is free for one launcher is free for another, too, until the node listens: both would give it away. So a
+    block is his who holds its first port; one that somebody else holds is passed over, after a port that is not free.
+    """
+    blocks = [PORTS[first : first + BLOCK] for first in range(0, len(PORTS), BLOCK)]
+    for n in count(os.getpid()):
+        mark, *ports = blocks[n % len(blocks)]
+        with socket.socket() as holder:
+            try:
+                holder.bind(("127.0.0.1", mark))
+            except OSError:
+                ports = [mark]
+            yield from ports
+
+
+_ports = _own_ports()
 
 
 def is_stopped(pid: int) -> bool:

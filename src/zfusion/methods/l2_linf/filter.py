@@ -14,11 +14,11 @@ cancels the neighbour out. A reading that a message says is not there is what it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.family import Family, Modes
 from zfusion.methods.gramians import lyapunov
 from zfusion.methods.l2_linf.design import METHOD, Design
@@ -164,8 +164,14 @@ class _Designer:
         return options.design(system, modes.networks, modes.transition)
 
     @staticmethod
-    def load(path: Path, options: L2LinfOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
-        return Design.load(path, options.fingerprint(system, modes.networks, modes.transition))
+    def unpack(
+        content: Content,
+        options: L2LinfOptions,
+        system: System,
+        network: Network,  # noqa: ARG004
+        modes: Modes,
+    ) -> Design:
+        return Design.unpack(content, options.fingerprint(system, modes.networks, modes.transition))
 
 
 def _check(options: L2LinfOptions, system: System, network: Network) -> None:
