@@ -41,6 +41,7 @@ ONLY = {
     "pydantic": ("model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
     "prometheus_client": ("report/exporters.py",),
     "opentelemetry": ("report/exporters.py",),
+    "psutil": ("swarm/watch.py",),
     "distributed": ("studies/experiment/engines.py",),
     "cvxpy": ("methods/convex.py",),
     "scipy": ("methods/convex.py",),

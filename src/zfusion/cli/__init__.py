@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, logs, models, observe, recordings, report
+from zfusion.cli import compare, experiment, library, live, logs, models, observe, recordings, report, soak
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -43,6 +43,7 @@ for command in (
     recordings.info,
     recordings.export,
     report.report,
+    soak.soak,
 ):
     app.command()(command)
 app.command(hidden=True)(live.network)

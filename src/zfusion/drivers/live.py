@@ -17,12 +17,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.clocks import Clock, WrongClock, machine
 from zfusion.drivers.complaints import Complaints
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.health import health
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.key_source import KeySource
@@ -76,6 +78,8 @@ class LiveOptions:
     """Last step; None: until told to stop."""
     emulate: bool = True
     """Whether the node is to do to its neighbours' messages what the scenario's links say; False: the network does."""
+    health_s: float = 0.0
+    """How often to tell of its health; 0: never."""
 
 
 class LiveNode:
@@ -88,8 +92,10 @@ class LiveNode:
         options: LiveOptions,
         tell: Callable[[Status], None] | None = None,
         announce: Callable[[Blow], None] | None = None,
+        tell_health: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
-        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before.
+        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before;
+        `tell_health` with `health.health`, as often as `options` say.
 
         Raises InputError where Zenoh does not open, or the sensor's source or a link's, and for a plan that stops the
         node where nobody is there to set it going again.
@@ -110,6 +116,8 @@ class LiveNode:
         """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
         self._told_ns = self._lingerless_ns = 0
+        self._tell_health, self._health_ns = tell_health, round(options.health_s * 1e9)
+        self._told_health_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
@@ -185,6 +193,17 @@ class LiveNode:
             counts=self._counts() if counted else None,
         )
 
+    def health(self, node: Node, account: Account) -> dict[str, Any]:
+        """See `health.health`."""
+        inbox = self._inbox
+        queues = {
+            "ahead": len(self._ahead),
+            "held": self._hearing.holds,
+            "posted": len(inbox.posted),
+            "notices": len(inbox.notices),
+        }
+        return health(node, account, queues=queues, overrun=inbox.overrun, now_ns=self._now())
+
     def report(self) -> NodeReport:
         """How it has gone so far."""
         node, account = self.node, self._account
@@ -211,8 +230,8 @@ class LiveNode:
         )
 
     def _overheard(self, by_source: Mapping[str, int]) -> dict[str, int]:
-        total = Counter(by_source) + self._presence.overheard
-        return {**total, "overrun": self._inbox.overrun} if self._inbox.overrun else dict(total)
+        here = Counter(overrun=self._inbox.overrun, unheeded=self._presence.unheeded)
+        return dict(Counter(by_source) + self._presence.overheard + here)
 
     def _clocks(self) -> dict[str, dict[str, float]]:
         return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
@@ -334,6 +353,9 @@ class LiveNode:
             self._tell_arrivals()
             if now - self._told_ns > REPORT_NS:
                 self.tell_status()
+            if self._health_ns and now - self._told_health_ns >= self._health_ns:
+                self._told_health_ns = now
+                self._tell_health(self.health(node, account))
         for estimate in self._estimates:
             account.compare(estimate)
         self._estimates.clear()

@@ -49,6 +49,9 @@ and Zenoh's thread may be waiting for that while it holds what dropping needs.""
 MAX_NOTICES = 4096
 """Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""
 
+MOST_NOTICES = 65_536
+"""Notices waiting, above which nothing more is noted, and that is counted: only somebody who floods makes so many."""
+
 RECORDER = "the recorder"
 """Stands for it among node ids."""
 
@@ -89,6 +92,8 @@ class Presence:
         self._now = clock.now
         self.overheard: Counter[str] = Counter()
         """What came and was neither a question nor an answer, by reason."""
+        self.unheeded = 0
+        """What happened and was not noted, too much being to be attended to."""
         self.strangers: set[NodeId] = set()
         """Neighbours that run something else than this node."""
         self._host, self._scenario, self._graph, self._run = host, scenario, graph, run
@@ -194,8 +199,11 @@ class Presence:
         return on_zenoh_thread(partial(self._note, kind))
 
     def _note(self, kind: str, about: Any) -> None:
-        if kind in QUESTIONS and len(self._inbox.notices) >= MAX_NOTICES:
-            about.drop()
+        waiting = len(self._inbox.notices)
+        if waiting >= (MAX_NOTICES if kind in QUESTIONS else MOST_NOTICES):
+            self.unheeded += 1
+            if kind in QUESTIONS:
+                about.drop()
         else:
             self._inbox.notify((kind, about, self._now()))
 
@@ -302,7 +310,7 @@ class Presence:
             status = replace(status, heard_ns=at_ns, told_ns=self._now())
             query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
             asker = question.get("from")
-            if isinstance(asker, int | str):
+            if isinstance(asker, int | str) and asker in self.meeting.linked:  # whoever else asks is not remembered
                 self._answered.add(asker)
                 if question.get("leaving"):
                     self._leaving.add(asker)

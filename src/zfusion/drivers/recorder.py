@@ -23,6 +23,7 @@ from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
+from zfusion.gaps import MAX_LIVES
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
@@ -35,6 +36,9 @@ log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
+
+MAX_NOTICES = 65_536
+"""Questions and news of nodes that wait; beyond it they are dropped, and counted: whoever asks can ask again."""
 
 CHANNEL = "all"
 
@@ -116,7 +120,12 @@ class Recorder:
         ]
 
     def _note(self, kind: str, about: Any) -> None:
-        self._inbox.notify((kind, about))
+        if len(self._inbox.notices) < MAX_NOTICES:
+            self._inbox.notify((kind, about))
+            return
+        self._report.unheeded += 1
+        if kind == "status?":
+            about.drop()
 
     def _record(self) -> None:
         inbox, writer = self._inbox, self._writer
@@ -192,7 +201,8 @@ class Recorder:
         for stage, count in sent.items():
             if isinstance(count, int) and isinstance(stage, str):
                 key = keys.truth_key(self._run) if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
-                self._sent[key][event["born"]] = count
+                if key in self._topics and len(self._sent[key].keys() | {event["born"]}) <= MAX_LIVES:
+                    self._sent[key][event["born"]] = count
 
     def _handle_notices(self) -> bool:
         """Act on what happened; True when it is time to end."""

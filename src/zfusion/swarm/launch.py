@@ -44,6 +44,9 @@ MAX_RESTARTS = 10
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
 
+TAIL_BYTES = 65_536
+"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
+
 PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
 between our finding it free and the node's listening on it."""
@@ -74,6 +77,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    health: Mapping[str, Any] = field(default_factory=dict)
+    """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
     told: bool = False
     """Whether it has reported on its present life."""
@@ -118,6 +123,8 @@ class LaunchOptions:
     restart: bool = False
     netns: str | None = None
     """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
+    health_s: float = 0.0
+    """How often every node tells of its health; 0: never."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -196,6 +203,8 @@ class Launcher:
                 command.append("--await-recorder")
             if self._network is not None:
                 command.append("--no-emulation")
+            if options.health_s:
+                command += ["--health", str(options.health_s)]
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
@@ -273,7 +282,7 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.told = None, None, {}, False
+        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _entrance(self, child: Child) -> Sequence[str]:
@@ -322,6 +331,8 @@ class Launcher:
             if "status" in message:
                 child.status = message["status"]
                 self._note_beginning(child.status)
+            elif "health" in message:
+                child.health = message["health"]
             elif "blow" in message:
                 self._note_blow(child, message["blow"])
                 child.reports += [message["report"]] if message["report"] else []
@@ -418,7 +429,9 @@ class Launcher:
         )
 
     def _tail(self, child: Child) -> str:
-        lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
+        with child.log.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
         return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
