@@ -10,16 +10,18 @@ Everything happens on one thread. Zenoh's callbacks only leave notices, which ar
 from __future__ import annotations
 
 import gc
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any, cast
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
-from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.clocks import Clock, machine
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
@@ -40,6 +42,8 @@ from zfusion.model.types import NodeId
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
 from zfusion.status import Phase, Status
+
+log = logging.getLogger(__name__)
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
@@ -120,7 +124,7 @@ class LiveNode:
         except InputError:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
-        self._clock = WrongClock() if self._misfortune.clock_goes_wrong else Clock()
+        self._clock = Clock()
         self._now = self._clock.now
         self._inbox = Inbox(self._session, self._clock)
         self._links = link if isinstance(link, LinkNetwork) else None
@@ -174,6 +178,9 @@ class LiveNode:
             fallbacks=node.fallbacks if node else 0,
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
+            line_ns=self._clock.line_ns,
+            clock_jumps=self._clock.jumps,
+            clock_offset_exceeded=self._presence.clocks.exceeded,
         )
 
     def report(self) -> NodeReport:
@@ -188,7 +195,8 @@ class LiveNode:
         report.overheard = dict(Counter(report.overheard) + self._presence.overheard)
         if self._inbox.overrun:
             report.overheard["overrun"] = self._inbox.overrun
-        report.clocks = {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+        report.clocks = {str(j): told for j, offset in self._presence.clocks.offsets.items() if (told := offset.told())}
+        report.clock_jumps, report.clock_offset_exceeded = self._clock.jumps, self._presence.clocks.exceeded
         report.queues = {"ahead": self._most_ahead, "held": self._hearing.most_held}
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
@@ -393,6 +401,7 @@ class LiveNode:
         """Tell what was measured of the neighbours' messages, when it is time to."""
         assert self._account is not None  # steps are taken with one
         for message in self._account.arrivals(self._now(), ended=ended):
+            self._presence.clocks.mark(cast("dict[str, Any]", message.fields["data"]))
             self._publish[ARRIVALS.name](encode(message))
 
     def _tell_truth(self, node: Node, step: int, now: int) -> None:
@@ -420,10 +429,18 @@ class LiveNode:
 
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
+        self._look_at_clock()
         self._told_ns = self._now()
         self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())
+
+    def _look_at_clock(self) -> None:
+        """See whether the machine's clock has jumped; this node's time goes on as before, but it is told."""
+        jump = self._clock.look()
+        if jump is not None and self.node is not None:
+            log.warning("the machine's clock has jumped: %s", jump)
+            self._carry_out([self.node.event("clock_jump", self._now(), **jump._asdict())])
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""

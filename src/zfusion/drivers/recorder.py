@@ -6,7 +6,6 @@ all that was published before it has arrived, so that nodes leave only when it h
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
@@ -76,7 +76,9 @@ class Recorder:
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
         )
-        self._inbox = Inbox(self._session)
+        self._clock = Clock()
+        self._clock.keep()
+        self._inbox = Inbox(self._session, self._clock)
         writer.is_legal = self.is_legal
 
     def run(self) -> RecorderReport:
@@ -115,14 +117,15 @@ class Recorder:
 
     def _record(self) -> None:
         inbox, writer = self._inbox, self._writer
-        next_flush = time.time_ns() + self._flush_ns
+        next_flush = self._clock.now() + self._flush_ns
         while True:
             sample = inbox.wait_sample(CHANNEL, next_flush)
-            now = time.time_ns()
+            now = self._clock.now()
             if sample is not None:
                 self._write(sample, now)
             if now >= next_flush:
                 next_flush = now + self._flush_ns
+                self._clock.look()
                 writer.flush()
                 if self._tell is not None:
                     self._tell(self._count())
@@ -215,7 +218,7 @@ class Recorder:
             sample = self._inbox.poll_sample(CHANNEL)
             if sample is None:
                 return
-            self._write(sample, time.time_ns())
+            self._write(sample, self._clock.now())
 
     def _on_token(self, sample: Any) -> None:
         try:
