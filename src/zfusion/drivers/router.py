@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from pathlib import Path
+
+os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 2), tx: (worker_threads: 2))")
+# Threads of their own, unlike in a node, and before Zenoh is imported: what comes in on one link goes out on another,
+# and where one thread does both, a full link waits for ever for the thread that waits for it.
 
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
