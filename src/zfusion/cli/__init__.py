@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, models, recordings, report
+from zfusion.cli import compare, deploy, experiment, library, live, models, recordings, report
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -32,6 +32,8 @@ for command in (
     live.simulate,
     live.node,
     live.record,
+    deploy.deploy,
+    deploy.router,
     models.design,
     compare.compare,
     compare.worst,

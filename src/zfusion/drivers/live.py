@@ -22,6 +22,7 @@ from typing import Any, cast
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.clocks import Clock, machine
+from zfusion.drivers.credentials import node_name
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
@@ -118,6 +119,7 @@ class LiveNode:
             options.endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
+            name=node_name(node),
         )
         try:
             self._source: Source = open_source(scenario, node, self._subscribe)

@@ -16,6 +16,7 @@ import zenoh
 
 from zfusion import keys
 from zfusion.drivers.clocks import Clock
+from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
@@ -75,6 +76,7 @@ class Recorder:
             endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
+            name=RECORDER_NAME,
         )
         self._clock = Clock()
         self._clock.keep()
