@@ -23,6 +23,7 @@ LAYERS = (
     ("drivers",),
     ("swarm",),
     ("deploy",),
+    ("doctor",),
     ("studies",),
     ("report",),
     ("cli",),
@@ -46,7 +47,7 @@ ONLY = {
 }
 """Packages, and the only places that import them."""
 
-ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player"}
+ZENOH_MODULES = {"inquiry", "key_source", "transport", "inbox", "presence", "recorder", "player"}
 
 NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py", "links/")
 
