@@ -22,7 +22,7 @@ from zfusion.status import Status
 ANSWER_S = 1.0
 """How long an answer may take: nodes answer between messages."""
 
-LINK_S = 3.0
+LINK_S = 2.0
 """How long it may take until a node is seen: links are dialled in the background."""
 
 POLL_S = 0.02
