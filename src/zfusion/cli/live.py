@@ -26,6 +26,7 @@ from zfusion.cli.common import (
     Seed,
     Steps,
     ToldTo,
+    ZenohConfig,
     control_of,
     default_directory,
     epoch_ns,
@@ -184,6 +185,7 @@ def node(
     run: RunName = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     epoch: Annotated[str | None, typer.Option(help="When step 0 is (RFC 3339).", show_default="agreed on")] = None,
     await_recorder: Annotated[bool, typer.Option(help="Begin only when a recorder is there.")] = False,
     forever: Annotated[bool, typer.Option("--forever", help="Take steps until stopped.")] = False,
@@ -201,7 +203,7 @@ def node(
 
     control = control_of(control_fd, deadly=True)
     with ToldTo(control):
-        loaded = load(scenario, steps, rate, free_run, seed, method)
+        loaded = load(scenario, steps, rate, free_run, seed, method, zenoh_config=zenoh_config)
         own = node_named(loaded, node_id)
         options = LiveOptions(
             run=given_run(run, loaded),
@@ -242,6 +244,7 @@ def record(
     run: RunName = None,
     connect: Connect = None,
     listen: Listen = None,
+    zenoh_config: ZenohConfig = None,
     network: Annotated[NetnsKind | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
     control_fd: ControlFd = None,
@@ -255,14 +258,15 @@ def record(
 
     control = control_of(control_fd, deadly=False)
     with ToldTo(control):
-        loaded = load_scenario(scenario)
+        as_written = load_scenario(scenario)
+        loaded = as_written.with_overrides(zenoh_config=zenoh_config)
         name = given_run(run, loaded)
         logs.about(name)
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
             output,
-            scenario_toml=loaded.anchored().to_toml(),
+            scenario_toml=as_written.anchored().to_toml(),  # where keys are kept is nobody's business
             run=name,
             method=method,
             seed=loaded.seed,

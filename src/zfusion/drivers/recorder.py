@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import platform
-import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +17,8 @@ from typing import Any
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import Clock
+from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
@@ -84,8 +85,11 @@ class Recorder:
             endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
+            name=RECORDER_NAME,
         )
-        self._inbox = Inbox(self._session)
+        self._clock = Clock()
+        self._clock.keep()
+        self._inbox = Inbox(self._session, self._clock)
         writer.is_legal = self.is_legal
 
     def run(self) -> RecorderReport:
@@ -129,14 +133,15 @@ class Recorder:
 
     def _record(self) -> None:
         inbox, writer = self._inbox, self._writer
-        next_flush = time.time_ns() + self._flush_ns
+        next_flush = self._clock.now() + self._flush_ns
         while True:
             sample = inbox.wait_sample(CHANNEL, next_flush)
-            now = time.time_ns()
+            now = self._clock.now()
             if sample is not None:
                 self._write(sample, now)
             if now >= next_flush:
                 next_flush = now + self._flush_ns
+                self._clock.look()
                 writer.flush()
                 if self._tell is not None:
                     self._tell(self._count())
@@ -243,7 +248,7 @@ class Recorder:
             sample = self._inbox.poll_sample(CHANNEL)
             if sample is None:
                 return number
-            self._write(sample, time.time_ns())
+            self._write(sample, self._clock.now())
         return CAPACITY
 
     def _on_token(self, sample: Any) -> None:

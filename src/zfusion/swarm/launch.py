@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
@@ -141,6 +142,8 @@ class Launcher:
         self._failures: list[str] = []
         self._interrupts = 0
         self._stop_by: float | None = None
+        self._clock = Clock()
+        self._clock.keep()
         self._begun = False
         """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
@@ -317,6 +320,7 @@ class Launcher:
                     child.line.stop()
 
     def _look_after_all(self) -> None:
+        self._clock.look()
         for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
         for child in self._everybody():
@@ -408,7 +412,7 @@ class Launcher:
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
         if blow["until_ns"] is not None:
-            left: float = (blow["until_ns"] - time.time_ns()) / 1e9
+            left: float = (blow["until_ns"] - self._clock.now()) / 1e9
             return left
         others = [other for other in self._nodes.values() if other is not child and other.running]
         reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
