@@ -107,6 +107,11 @@ class Command:
         """What it has said on standard error so far."""
         return self._err.read_text()
 
+    @property
+    def heard(self) -> bool:
+        """Whether it has said anything on standard output."""
+        return self._out.stat().st_size > 0
+
     def interrupt(self) -> None:
         """Ctrl-C."""
         self.process.send_signal(signal.SIGINT)

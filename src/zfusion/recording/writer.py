@@ -112,6 +112,11 @@ class RecordingWriter:
         with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
 
+    def lost(self) -> dict[str, int]:
+        """By topic: what is missing so far between the messages that came, where anything is."""
+        between = {topic: channel.counter.gaps().lost_between for topic, channel in self._channels.items()}
+        return {topic: lost for topic, lost in between.items() if lost}
+
     def sync(self) -> None:
         """Have the operating system put what was flushed on the disk: it survives a power cut. Takes 4 to 50 ms."""
         with self._writing():

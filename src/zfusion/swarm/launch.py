@@ -22,6 +22,7 @@ from typing import Any
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
+from zfusion.drivers.registry import Entry, registered
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -42,6 +43,9 @@ MAX_RESTARTS = 10
 
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
+
+TAIL_BYTES = 65_536
+"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
 
 PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
@@ -73,6 +77,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    health: Mapping[str, Any] = field(default_factory=dict)
+    """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
     told: bool = False
     """Whether it has reported on its present life."""
@@ -117,6 +123,8 @@ class LaunchOptions:
     restart: bool = False
     netns: str | None = None
     """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
+    health_s: float = 0.0
+    """How often every node tells of its health; 0: never."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -156,7 +164,8 @@ class Launcher:
                 for child in self._everybody():
                     if child is not self._network:
                         self._start(child)
-            self._watch_nodes()
+            with registered(self._entry()):
+                self._watch_nodes()
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
@@ -183,6 +192,7 @@ class Launcher:
         scenario, options = self._scenario, self._options
         transport, common = scenario.transport, ["--run", options.run]
         listens, recorder_dials = self._endpoints()
+        self._dials, self._recorder_listens = recorder_dials, ""
         nodes: dict[NodeId, Child] = {}
         for place, i in enumerate(scenario.ids):
             command = [*ZFUSION, "node", str(self._file), "--id", str(i), *common]
@@ -193,12 +203,16 @@ class Launcher:
                 command.append("--await-recorder")
             if self._network is not None:
                 command.append("--no-emulation")
+            if options.health_s:
+                command += ["--health", str(options.health_s)]
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
             command = [*ZFUSION, "record", str(self._file), *common, "-o", str(options.recording)]
             if self._network is not None or not transport.zenoh_config:
                 command += _each("--connect", [recorder_dials[i] for i in scenario.ids])
+                [self._recorder_listens] = free_endpoints(1)  # for observers: peers pass nothing on
+                command += ["--listen", self._recorder_listens]
             recorder = Child("the recorder", None, command, options.logs / "recorder.log", len(scenario.ids))
         return recorder, nodes
 
@@ -210,6 +224,21 @@ class Launcher:
             return {p.node: p.endpoint for p in where}, {p.node: p.recorder_dials for p in where}
         listens = dict(zip(ids, free_endpoints(len(ids)), strict=True)) | self._scenario.transport.endpoints
         return listens, listens
+
+    def _entry(self) -> Entry:
+        """What observers on this machine need in order to look at the run."""
+        transport, network = self._scenario.transport, self._network
+        own = None if network is not None else transport.zenoh_config
+        enter = network.status.get("enter", ()) if network is not None else ()
+        return Entry(
+            run=self._options.run,
+            scenario=self._scenario.name,
+            endpoints={str(i): endpoint for i, endpoint in self._dials.items()},
+            recorder=self._recorder_listens if self._recorder is not None else None,
+            low_latency=transport.preset == "lowlatency",
+            config=str(self._scenario.absolute(own)) if own else None,
+            enter=tuple(enter[len(self._scenario.ids)]) if enter else (),
+        )
 
     def _plan_network(self) -> Child | None:
         options = self._options
@@ -253,7 +282,7 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.told = None, None, {}, False
+        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _entrance(self, child: Child) -> Sequence[str]:
@@ -302,6 +331,8 @@ class Launcher:
             if "status" in message:
                 child.status = message["status"]
                 self._note_beginning(child.status)
+            elif "health" in message:
+                child.health = message["health"]
             elif "blow" in message:
                 self._note_blow(child, message["blow"])
                 child.reports += [message["report"]] if message["report"] else []
@@ -398,7 +429,9 @@ class Launcher:
         )
 
     def _tail(self, child: Child) -> str:
-        lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
+        with child.log.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
         return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
