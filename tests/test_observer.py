@@ -15,6 +15,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -255,6 +256,22 @@ def test_several_runs_are_told_apart(run: str, directory: Path) -> None:
         with pytest.raises(InputError, match="--run"):
             find_swarm(directory / "observed.toml")
     assert [entry.run for entry in registry.entries()] == [run]
+
+
+def test_nodes_that_were_started_one_by_one_are_one_run(own_registry: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(own_registry / "apart"))
+    (own_registry / "apart").mkdir()
+    elsewhere = {"1": "tcp/10.0.0.1:7450", "2": "tcp/10.0.0.2:7450", "10": "tcp/10.0.0.3:7450"}
+    first = registry.Entry("run", "s", {"2": "tcp/0.0.0.0:7777"}, elsewhere)
+    other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    second = replace(first, endpoints={"1": "tcp/127.0.0.1:8888"}, pid=other.pid, birth=registry.birth(other.pid))
+    with registry.registered(first), registry.registered(second), registry.registered(replace(first, run="another")):
+        swarm = find_swarm(run="run")
+        other.communicate(b"\n")
+        alone = find_swarm(run="run")
+    assert swarm.nodes == alone.nodes == ("1", "2", "10")
+    assert set(swarm.endpoints.connect) == {"tcp/127.0.0.1:8888", "tcp/127.0.0.1:7777", "tcp/10.0.0.3:7450"}
+    assert set(alone.endpoints.connect) == {"tcp/10.0.0.1:7450", "tcp/127.0.0.1:7777", "tcp/10.0.0.3:7450"}
 
 
 def test_notes_of_processes_that_are_gone_are_removed(own_registry: Path) -> None:
