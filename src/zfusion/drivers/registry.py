@@ -130,10 +130,10 @@ def _read(path: Path) -> Entry | None:
 def birth(pid: int) -> str | None:
     """When a process began, since this machine did, and which start of the machine; None where there is none."""
     try:
-        started = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+        state, *rest = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return "running" if not Path("/proc/self/stat").exists() and _exists(pid) else None
-    return f"{machine()}/{started}"
+    return None if state == "Z" else f"{machine()}/{rest[18]}"
 
 
 def _exists(pid: int) -> bool:
