@@ -323,7 +323,7 @@ def test_top_on_a_terminal_ends_with_q(run: str, directory: Path) -> None:
 
 
 def test_an_observer_that_stands_still_holds_nobody_up_beyond_its_lease(directory: Path) -> None:
-    """Messages of 37 kB, fifty a second: the links to the observer are full before its lease is over."""
+    """Messages of 37 kB, fifty a second, so that its links fill."""
     nx, rate = 64, 50
     system = {"F": np.eye(nx).tolist(), "Q": np.eye(nx).tolist(), "initial_mean": [0.0] * nx}
     system |= {"initial_covariance": np.eye(nx).tolist()}
