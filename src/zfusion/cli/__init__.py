@@ -13,7 +13,20 @@ import typer
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, logs, models, observe, recordings, report
+from zfusion.cli import (
+    compare,
+    deploy,
+    doctor,
+    experiment,
+    library,
+    live,
+    logs,
+    models,
+    observe,
+    recordings,
+    report,
+    soak,
+)
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -35,6 +48,9 @@ for command in (
     observe.echo,
     observe.hz,
     observe.metrics,
+    deploy.deploy,
+    deploy.router,
+    doctor.doctor,
     models.design,
     compare.compare,
     compare.worst,
@@ -43,6 +59,7 @@ for command in (
     recordings.info,
     recordings.export,
     report.report,
+    soak.soak,
 ):
     app.command()(command)
 app.command(hidden=True)(live.network)

@@ -90,6 +90,11 @@ class L2Linf:
         """A step without any message, not even the own measurement."""
         self._move(step, {})
 
+    def unheard(self, step: int) -> tuple[NodeId, ...]:
+        """The neighbours that the mode of the step does not have."""
+        linked = self._linked[self._modes(step)]
+        return tuple(j for j in self._neighbourhood if self._position[j] not in linked)
+
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
         """The estimate of this step, and the filter's move to the next."""
         linked = self._linked[self._modes(step)]
