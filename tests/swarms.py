@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
@@ -85,13 +85,14 @@ class Result:
 class Command:
     """A zfusion command that runs, in a directory of its own making."""
 
-    def __init__(self, directory: Path, *words: object) -> None:
+    def __init__(self, directory: Path, *words: object, entrance: Sequence[str] = ()) -> None:
+        """`entrance` has the words before it that have it run somewhere else."""
         number = next(_numbers)
         self._out, self._err = (directory / f"command{number}.{name}" for name in ("out", "err"))
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [*ZFUSION, *map(str, words)],
+                [*entrance, *ZFUSION, *map(str, words)],
                 cwd=directory,
                 stdout=out,
                 stderr=err,
