@@ -89,14 +89,13 @@ class Result:
 class Command:
     """A zfusion command that runs, in a directory of its own making."""
 
-    def __init__(self, directory: Path, *words: object, entrance: Sequence[str] = ()) -> None:
-        """`entrance` has the words before it that have it run somewhere else."""
+    def __init__(self, directory: Path, *words: object, program: Sequence[object] = ZFUSION) -> None:
         number = next(_numbers)
         self._out, self._err = (directory / f"command{number}.{name}" for name in ("out", "err"))
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [*MORTAL, *entrance, *ZFUSION, *map(str, words)],
+                [*MORTAL, *map(str, program), *map(str, words)],
                 cwd=directory,
                 stdout=out,
                 stderr=err,

@@ -6,6 +6,7 @@ Needs root and the kernel for it; where they are missing, the tests say so and a
 from __future__ import annotations
 
 import shutil
+import signal
 import socket
 from pathlib import Path
 

@@ -93,7 +93,13 @@ class Status:
     estimate: Mapping[str, list[float]] = field(default_factory=dict)
     """The last one, where there is one: x, and sd, the standard deviations of its errors. For people to look at."""
     machine: str | None = None
-    """Of nodes that tell the same here the clocks are one; None where nothing can be said."""
+    """Nodes that tell the same here count the same time; None where nothing can be said."""
+    line_ns: int = 0
+    """Where the node's time line begins, on that count."""
+    clock_jumps: int = 0
+    """How often its machine's clock was seen to jump."""
+    clock_offset_exceeded: int = 0
+    """Readings of neighbours' clocks that were beyond what is allowed."""
     heard_ns: int = 0
     """When the question was heard that this answers, and when the answer was told, on the node's clock."""
     told_ns: int = 0
@@ -128,6 +134,9 @@ class Status:
                 fallbacks=_typed(raw, "fallbacks", int),
                 estimate=_vectors(raw, "estimate"),
                 machine=None if raw["machine"] is None else _typed(raw, "machine", str),
+                line_ns=_typed(raw, "line_ns", int),
+                clock_jumps=_typed(raw, "clock_jumps", int),
+                clock_offset_exceeded=_typed(raw, "clock_offset_exceeded", int),
                 heard_ns=_typed(raw, "heard_ns", int),
                 told_ns=_typed(raw, "told_ns", int),
                 counts=Counts.from_map(raw["counts"]) if raw.get("counts") is not None else None,

@@ -13,7 +13,20 @@ import typer
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, deploy, experiment, library, live, logs, models, observe, recordings, report
+from zfusion.cli import (
+    compare,
+    deploy,
+    doctor,
+    experiment,
+    library,
+    live,
+    logs,
+    models,
+    observe,
+    recordings,
+    report,
+    soak,
+)
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -30,13 +43,14 @@ for command in (
     live.simulate,
     live.node,
     live.record,
-    deploy.deploy,
-    deploy.router,
     observe.status,
     observe.top,
     observe.echo,
     observe.hz,
     observe.metrics,
+    deploy.deploy,
+    deploy.router,
+    doctor.doctor,
     models.design,
     compare.compare,
     compare.worst,
@@ -45,6 +59,7 @@ for command in (
     recordings.info,
     recordings.export,
     report.report,
+    soak.soak,
 ):
     app.command()(command)
 app.command(hidden=True)(live.network)

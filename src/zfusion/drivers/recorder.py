@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import platform
-import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,12 +17,14 @@ from typing import Any
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
+from zfusion.gaps import MAX_LIVES
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
@@ -36,6 +37,9 @@ log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
+
+MAX_NOTICES = 65_536
+"""Questions and news of nodes that wait; beyond it they are dropped, and counted: whoever asks can ask again."""
 
 CHANNEL = "all"
 
@@ -92,7 +96,9 @@ class Recorder:
             config_file=scenario.absolute(config) if config else None,
             name=RECORDER_NAME,
         )
-        self._inbox = Inbox(self._session)
+        self._clock = Clock()
+        self._clock.keep()
+        self._inbox = Inbox(self._session, self._clock)
         writer.is_legal = self.is_legal
 
     def run(self) -> RecorderReport:
@@ -127,18 +133,24 @@ class Recorder:
         ]
 
     def _note(self, kind: str, about: Any) -> None:
-        self._inbox.notify((kind, about))
+        if len(self._inbox.notices) < MAX_NOTICES:
+            self._inbox.notify((kind, about))
+            return
+        self._report.unheeded += 1
+        if kind == "status?":
+            about.drop()
 
     def _record(self) -> None:
         inbox, writer = self._inbox, self._writer
-        next_flush = time.time_ns() + self._flush_ns
+        next_flush = self._clock.now() + self._flush_ns
         while True:
             sample = inbox.wait_sample(CHANNEL, next_flush)
-            now = time.time_ns()
+            now = self._clock.now()
             if sample is not None:
                 self._write(sample, now)
             if now >= next_flush:
                 next_flush = now + self._flush_ns
+                self._clock.look()
                 writer.flush()
                 if self._tell is not None:
                     self._tell(self._count())
@@ -206,7 +218,8 @@ class Recorder:
         for stage, count in sent.items():
             if isinstance(count, int) and isinstance(stage, str):
                 key = keys.truth_key(self._run) if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
-                self._sent[key][event["born"]] = count
+                if key in self._topics and len(self._sent[key].keys() | {event["born"]}) <= MAX_LIVES:
+                    self._sent[key][event["born"]] = count
 
     def _handle_notices(self) -> None:
         """Act on what happened."""
@@ -252,7 +265,7 @@ class Recorder:
             sample = self._inbox.poll_sample(CHANNEL)
             if sample is None:
                 return number
-            self._write(sample, time.time_ns())
+            self._write(sample, self._clock.now())
         return CAPACITY
 
     def _on_token(self, sample: Any) -> None:
@@ -270,7 +283,7 @@ class Recorder:
             log.info("node %s is there", node)
         else:
             self._present.discard(node)
-            self._nobody_since_ns = time.time_ns()
+            self._nobody_since_ns = self._clock.now()
             log.info("node %s is gone", node)
 
     def _finish(self) -> None:

@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
@@ -43,6 +44,9 @@ MAX_RESTARTS = 10
 
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
+
+TAIL_BYTES = 65_536
+"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
 
 PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
@@ -74,6 +78,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    health: Mapping[str, Any] = field(default_factory=dict)
+    """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
     told: bool = False
     """Whether it has reported on its present life."""
@@ -118,6 +124,8 @@ class LaunchOptions:
     restart: bool = False
     netns: str | None = None
     """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
+    health_s: float = 0.0
+    """How often every node tells of its health; 0: never."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -134,6 +142,8 @@ class Launcher:
         self._failures: list[str] = []
         self._interrupts = 0
         self._stop_by: float | None = None
+        self._clock = Clock()
+        self._clock.keep()
         self._begun = False
         """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
@@ -196,6 +206,8 @@ class Launcher:
                 command.append("--await-recorder")
             if self._network is not None:
                 command.append("--no-emulation")
+            if options.health_s:
+                command += ["--health", str(options.health_s)]
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
@@ -273,7 +285,7 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.told = None, None, {}, False
+        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _entrance(self, child: Child) -> Sequence[str]:
@@ -308,6 +320,7 @@ class Launcher:
                     child.line.stop()
 
     def _look_after_all(self) -> None:
+        self._clock.look()
         for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
         for child in self._everybody():
@@ -322,6 +335,8 @@ class Launcher:
             if "status" in message:
                 child.status = message["status"]
                 self._note_beginning(child.status)
+            elif "health" in message:
+                child.health = message["health"]
             elif "blow" in message:
                 self._note_blow(child, message["blow"])
                 child.reports += [message["report"]] if message["report"] else []
@@ -397,7 +412,7 @@ class Launcher:
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
         if blow["until_ns"] is not None:
-            left: float = (blow["until_ns"] - time.time_ns()) / 1e9
+            left: float = (blow["until_ns"] - self._clock.now()) / 1e9
             return left
         others = [other for other in self._nodes.values() if other is not child and other.running]
         reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
@@ -418,7 +433,9 @@ class Launcher:
         )
 
     def _tail(self, child: Child) -> str:
-        lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
+        with child.log.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
         return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
