@@ -115,13 +115,12 @@ def _shake_hands(credentials: Credentials, address: str | None) -> tuple[str, da
             except ssl.SSLWantReadError:
                 continue
             except ssl.SSLCertVerificationError as error:
-                raise InputError(f"{credentials.certificate}: {_reason(error)}") from None
+                raise InputError(f"{credentials.certificate}: {reason_of(error)}") from None
             except ssl.SSLError as error:
                 raise InputError(f"{credentials.certificate}: TLS refuses it: {error.reason or error}") from None
     certificate = ends[0].getpeercert() or {}
-    subject = dict(pair for pairs in certificate.get("subject", ()) for pair in pairs)  # type: ignore[misc]
     ends_at = ssl.cert_time_to_seconds(str(certificate["notAfter"]))
-    return str(subject.get("commonName", "")), datetime.fromtimestamp(ends_at, UTC)
+    return common_name_of(certificate), datetime.fromtimestamp(ends_at, UTC)
 
 
 def _context(credentials: Credentials, purpose: int) -> ssl.SSLContext:
@@ -146,5 +145,12 @@ def _context(credentials: Credentials, purpose: int) -> ssl.SSLContext:
     return context
 
 
-def _reason(error: ssl.SSLCertVerificationError) -> str:
+def common_name_of(certificate: Mapping[str, Any]) -> str:
+    """The common name of a certificate as the ssl module tells of it; empty where it has none."""
+    subject = dict(pair for pairs in certificate.get("subject", ()) for pair in pairs)
+    return str(subject.get("commonName", ""))
+
+
+def reason_of(error: ssl.SSLCertVerificationError) -> str:
+    """What is wrong with a certificate, in words."""
     return REASONS.get(error.verify_code, error.verify_message)

@@ -35,7 +35,7 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, never_linger, open_session, publisher
+from zfusion.drivers.transport import RECEIPT, never_linger, open_session, prober, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
@@ -150,7 +150,15 @@ class LiveNode:
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
         self._presence = Presence(
-            self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock
+            self,
+            self._meeting,
+            scenario,
+            self._graph,
+            options.run,
+            self._session,
+            self._inbox,
+            self._clock,
+            prober(options.endpoints, scenario.absolute(config) if config else None),
         )
 
     def run(self) -> NodeReport:

@@ -23,6 +23,7 @@ from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock
 from zfusion.drivers.endpoints import linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
+from zfusion.drivers.probe import Prober
 from zfusion.drivers.transport import never_linger, on_zenoh_thread
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Reason, decode_any, encode_any
@@ -88,6 +89,7 @@ class Presence:
         session: zenoh.Session,
         inbox: Inbox,
         clock: Clock,
+        prober: Prober,
     ) -> None:
         self.meeting = meeting
         self._now = clock.now
@@ -98,7 +100,7 @@ class Presence:
         self.strangers: set[NodeId] = set()
         """Neighbours that run something else than this node."""
         self._host, self._scenario, self._graph, self._run = host, scenario, graph, run
-        self._session, self._inbox = session, inbox
+        self._session, self._inbox, self._prober = session, inbox, prober
         self._unconfirmed: set[NodeId] = set()
         """Who has not said yet that it has this node's last messages."""
         self._leaving: set[NodeId] = set()
@@ -159,6 +161,8 @@ class Presence:
             if now >= next_word:
                 next_word = now + WORD_NS
                 log.warning("waiting for %s", ", ".join(self.meeting.missing()))
+                if not self.meeting.linked <= self.meeting.present:
+                    self._prober.look()
             self._inbox.rest(next_poll)
         return None
 

@@ -43,6 +43,12 @@ MAX_NOTICES = 65_536
 
 CHANNEL = "all"
 
+RETURN_NS = 5_000_000_000
+"""How long nodes that were out of sight may take to come back, once their router has."""
+
+SETTLED_NS = 500_000_000
+"""How soon it is known, when everybody is gone, whether the router is."""
+
 
 @dataclass(slots=True)
 class _Topic:
@@ -76,6 +82,9 @@ class Recorder:
         self._flush_ns = round(scenario.recording.flush_interval_s * 1e9)
         self._seen: set[str] = set()
         self._present: set[str] = set()
+        self._routed = False
+        """Whether nodes are reached through a router."""
+        self._nobody_since_ns = 0
         self._stopping = False
         self._bell = f"{keys.recorder_token(run)}/bell"
         self._sent: dict[str, dict[int, int]] = defaultdict(dict)
@@ -145,7 +154,10 @@ class Recorder:
                 writer.flush()
                 if self._tell is not None:
                     self._tell(self._count())
-            if inbox.notices and self._handle_notices():
+            if inbox.notices:
+                self._handle_notices()
+            if self._stopping or self._everybody_left(now):
+                self._drain()
                 return
 
     def _write(self, sample: Any, now: int) -> None:
@@ -209,8 +221,8 @@ class Recorder:
                 if key in self._topics and len(self._sent[key].keys() | {event["born"]}) <= MAX_LIVES:
                     self._sent[key][event["born"]] = count
 
-    def _handle_notices(self) -> bool:
-        """Act on what happened; True when it is time to end."""
+    def _handle_notices(self) -> None:
+        """Act on what happened."""
         notices = self._inbox.notices
         for _ in range(len(notices)):
             notice = notices.popleft()
@@ -221,11 +233,16 @@ class Recorder:
                 self._on_token(about)
             else:
                 self._answer(about)
-        everybody_left = self._until_all_gone and self._seen == self._ids and not self._present
-        if self._stopping or everybody_left:
-            self._drain()
+
+    def _everybody_left(self, now: int) -> bool:
+        """Whether all nodes have been here and have gone. Behind a router they may only be out of sight with it."""
+        if not self._until_all_gone or self._seen != self._ids or self._present:
+            return False
+        if not self._routed:
             return True
-        return False
+        if not self._session.info.routers_zid():
+            self._nobody_since_ns = now + RETURN_NS
+        return now > self._nobody_since_ns + SETTLED_NS
 
     def _answer(self, query: Any) -> None:
         """Tell what is on the file, and how much waited for it."""
@@ -260,11 +277,13 @@ class Recorder:
             return
         if sample.kind == zenoh.SampleKind.PUT:
             never_linger()  # there is a new link
+            self._routed = bool(self._session.info.routers_zid())
             self._seen.add(node)
             self._present.add(node)
             log.info("node %s is there", node)
         else:
             self._present.discard(node)
+            self._nobody_since_ns = self._clock.now()
             log.info("node %s is gone", node)
 
     def _finish(self) -> None:

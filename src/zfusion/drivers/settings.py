@@ -34,7 +34,8 @@ def base_settings(mode: str = "peer", *, low_latency: bool = False) -> dict[str,
         "scouting/delay": 1,  # nothing is scouted: do not wait for it
         "listen/endpoints": [],
         "connect/endpoints": [],
-        "connect/timeout_ms": -1,  # keep trying, in the background
+        # Keep trying, in the background. A client cannot: it tries each router once, and the session is opened again.
+        "connect/timeout_ms": 0 if mode == "client" else -1,
         "connect/exit_on_failure": False,
         "connect/retry": RETRY,
         "timestamping/enabled": True,

@@ -13,6 +13,7 @@ import os
 import socket
 import stat
 import struct
+import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -28,6 +29,7 @@ import zenoh
 
 from zfusion.drivers.credentials import RENEW, Credentials, prove
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.probe import Prober, Route
 from zfusion.drivers.settings import base_settings
 from zfusion.errors import InputError
 
@@ -35,6 +37,15 @@ log = logging.getLogger(__name__)
 
 SOON = timedelta(days=14)
 """How long before it expires a certificate is spoken of."""
+
+UNREACHED = "Unable to connect to any of"
+"""What Zenoh says when a client reaches none of its routers."""
+
+AGAIN_S = 0.25
+"""How soon a client tries its routers again."""
+
+WORD_S = 5.0
+"""How often it is said that one is waited for."""
 
 RECEIPT = zenoh.TimestampInstrumentationBuilder().set_receive(True).build()
 """Has the receiving session stamp a message when it comes: 5 to 10 µs of work at each end."""
@@ -53,17 +64,18 @@ def open_session(
     A user's `config_file` comes first; the endpoints, where given, replace its own. Where it has certificates they are
     proven first, as those of `name` where there are rules about names.
     """
-    config = _base_config(config_file, mode, low_latency)
+    config = _config(endpoints, config_file, mode, low_latency)
     _prove(config, name)
-    if endpoints.listen:
-        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
-    if endpoints.connect:
-        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
         raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+
+
+def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
+    """What can say why those that a session dials do not come; given what the session is opened with."""
+    return _prober(_config(endpoints, config_file=config_file))
 
 
 def never_linger() -> None:
@@ -100,6 +112,48 @@ def on_zenoh_thread(callback: Callable[[Any], None]) -> Any:
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
+def _config(
+    endpoints: Endpoints, config_file: Path | None = None, mode: str = "peer", low_latency: bool = False
+) -> zenoh.Config:
+    config = _base_config(config_file, mode, low_latency)
+    if endpoints.listen:
+        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
+    if endpoints.connect:
+        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
+    return config
+
+
+def _opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; a client's when one of its routers is there, which Zenoh does not wait for."""
+    next_word = time.monotonic()
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if _setting(config, "mode") != "client" or UNREACHED not in str(error):
+                raise
+        if time.monotonic() >= next_word:
+            next_word = time.monotonic() + WORD_S
+            log.warning("waiting for a router")
+            _prober(config).look()
+        time.sleep(AGAIN_S)
+
+
+def _setting(config: zenoh.Config, path: str) -> Any:
+    return json.loads(config.get_json(path))
+
+
+def _prober(config: zenoh.Config) -> Prober:
+    dialled = _setting(config, "connect/endpoints")
+    if isinstance(dialled, dict):  # by the mode of the session
+        dialled = dialled.get(_setting(config, "mode"), [])
+    credentials = Credentials.of(_setting(config, "transport/link/tls"))
+    subjects = _setting(config, "access_control/subjects") or []
+    names = frozenset(name for subject in subjects for name in subject.get("cert_common_names") or ())
+    connecting = credentials[-1] if credentials else None
+    return Prober([Route(endpoint, connecting, names) for endpoint in dialled if isinstance(endpoint, str)])
+
+
 def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zenoh.Config:
     if config_file is not None:
         try:
@@ -116,8 +170,8 @@ def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zeno
 
 def _prove(config: zenoh.Config, name: str | None) -> None:
     """See that the certificates of a configuration are good, before Zenoh waits with them for ever."""
-    by_names = json.loads(config.get_json("access_control/enabled"))
-    for credentials in Credentials.of(json.loads(config.get_json("transport/link/tls"))):
+    by_names = _setting(config, "access_control/enabled")
+    for credentials in Credentials.of(_setting(config, "transport/link/tls")):
         proven = prove(credentials, common_name=name if by_names else None)
         left = proven.ends - datetime.now(UTC)
         if left < SOON:
