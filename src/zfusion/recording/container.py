@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk
+from mcap.records import Attachment, Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 from zfusion.errors import RecordingError
@@ -121,11 +121,13 @@ def unpack_chunk(body: bytes, position: int) -> tuple[Chunk, bytes]:
     return chunk, data
 
 
-def chunk_channels(data: bytes, position: int) -> Iterator[Channel]:
-    """The channels that a chunk's records declare. `position` is the chunk's, for errors."""
+def chunk_declarations(data: bytes, position: int) -> Iterator[Channel | Schema]:
+    """The channels and schemas that a chunk's records declare. `position` is the chunk's, for errors."""
     for opcode, start, end in _chunk_frames(data, position):
         if opcode == Opcode.CHANNEL:
             yield parse(Channel, Frame(opcode, position, b"", data[start:end]))
+        elif opcode == Opcode.SCHEMA:
+            yield parse(Schema, Frame(opcode, position, b"", data[start:end]))
 
 
 def chunk_messages(
