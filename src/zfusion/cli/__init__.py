@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, models, recordings, report
+from zfusion.cli import compare, experiment, library, live, models, recordings, repair, report
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -39,6 +39,9 @@ for command in (
     recordings.replay,
     recordings.info,
     recordings.export,
+    repair.recover,
+    repair.merge,
+    repair.cut,
     report.report,
 ):
     app.command()(command)

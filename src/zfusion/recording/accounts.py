@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 
 from zfusion.errors import MessageError
 from zfusion.gaps import GapCounter, Gaps
 from zfusion.messages import Stamp, decode_any, read_stamp
+from zfusion.recording.layout import unsealed
 from zfusion.stages import EVENT, TRUTH
 
 _UNKNOWN = Stamp(0, 0, 0, 0)
@@ -66,3 +69,13 @@ class Accounts:
             if isinstance(count, int) and isinstance(stage, str):
                 key = f"{run}/{TRUTH.name}" if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
                 self._sent.setdefault(key, {})[event["born"]] = count
+
+
+def stated_accounts(metadata: Mapping[str, str]) -> dict[str, Gaps]:
+    """The accounts that a file states."""
+    return {topic: Gaps(**json.loads(account)) for topic, account in unsealed(metadata).items()}
+
+
+def to_state(accounts: Mapping[str, Gaps]) -> dict[str, str]:
+    """The accounts as a file states them."""
+    return {topic: json.dumps(asdict(account)) for topic, account in accounts.items()}

@@ -7,7 +7,6 @@ anything is done with it. A file that merely ends too early is read as far as it
 
 from __future__ import annotations
 
-import json
 import os
 import zlib
 from collections.abc import Iterator, Mapping, Set
@@ -21,6 +20,7 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Metadata, Sche
 from zfusion.errors import RecordingError
 from zfusion.gaps import Gaps
 from zfusion.recording import layout
+from zfusion.recording.accounts import stated_accounts
 from zfusion.recording.channels import Description, described, from_metadata
 from zfusion.recording.container import (
     MAGIC,
@@ -152,7 +152,7 @@ class RecordedFile:
         stated = self._contents.metadata.get(layout.STATISTICS)
         if stated is None or not self.finished:
             return None
-        return {topic: Gaps(**json.loads(account)) for topic, account in layout.unsealed(stated).items()}
+        return stated_accounts(stated)
 
     def records(self, chosen: Set[str] | None, start_ns: int = 0, end_ns: int = EVER) -> Iterator[Record]:
         """The messages as in `Recording.records`. RecordingError if the file has changed since it was opened."""

@@ -45,6 +45,8 @@ PREVIOUS = "previous"
 """Fact: the name of the file before, in segments from 1 on."""
 NEXT = "next"
 """Fact at the close: the name of the file in which the recording goes on."""
+IN_SEGMENT = "segment_messages"
+"""Fact at the close: messages in this file."""
 STOPPED = "stopped"
 """Fact at the close: why the recording ended before the run did."""
 

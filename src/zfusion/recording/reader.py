@@ -28,7 +28,9 @@ class Recording:
         self.files = tuple(file.path for file in files)
         """Where it is: one file, or its segments."""
         self.size_bytes = sum(file.size_bytes for file in files)
-        notes = [*(file.note for file in files), *notes, *_told(last)]
+        notes = [*(note for file in files for note in (file.note, file.derived.get("note", ""))), *notes]
+        if layout.STOPPED in last.closing:
+            notes.append(f"stopped before the run ended: {last.closing[layout.STOPPED]}")
         self.note = "; ".join(filter(None, notes))
         """What is not on it, of a recording that is not complete."""
         self.complete = not self.note
@@ -106,14 +108,6 @@ class Recording:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _told(last: RecordedFile) -> Iterator[str]:
-    """What the last file itself says is missing."""
-    if layout.STOPPED in last.closing:
-        yield f"stopped before the run ended: {last.closing[layout.STOPPED]}"
-    if last.derived.get("note"):
-        yield last.derived["note"]
 
 
 def _follow(files: list[RecordedFile]) -> Iterator[str]:

@@ -7,11 +7,9 @@ that gets too large, or too long, goes on in another file (`layout`).
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,7 +17,7 @@ from typing import Self
 from zfusion.errors import RecordingError, RunError
 from zfusion.gaps import Gaps
 from zfusion.recording import layout
-from zfusion.recording.accounts import Accounts
+from zfusion.recording.accounts import Accounts, to_state
 from zfusion.recording.channels import by_stages
 from zfusion.recording.keeping import Keeping, Syncer
 from zfusion.recording.provenance import clocks, machine, software
@@ -223,9 +221,9 @@ class RecordingWriter:
         """Finish the file that is open."""
         if accounts is None:
             accounts = self._accounts.gaps()
-        end = clocks() | {"messages": str(self.messages), "refused": str(self._refused)} | dict(facts)
-        told = {topic: json.dumps(asdict(account)) for topic, account in accounts.items()}
-        self._segment.finish({layout.STATISTICS: told, layout.CLOSE: end})
+        counts = {"messages": self.messages, layout.IN_SEGMENT: self._segment.messages, "refused": self._refused}
+        end = clocks() | {name: str(count) for name, count in counts.items()} | dict(facts)
+        self._segment.finish({layout.STATISTICS: to_state(accounts), layout.CLOSE: end})
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
