@@ -24,11 +24,12 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from recordings import SCENARIO_TOML, START_NS, contents, open_writer, read, record, traffic
 from zfusion import gaps as gaps_module
 from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
-from zfusion.recording import GapCounter, Gaps, Record, Recording, RecordingWriter, arithmetic_differences
+from zfusion.recording import GapCounter, Gaps, Record, Recording, arithmetic_differences
 from zfusion.recording import segment as segment_module
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info
@@ -36,57 +37,9 @@ from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed
 from zfusion.recording.provenance import machine, software
 from zfusion.stages import TRUTH_SENDER, Field, Kind, Message, Stage
 
-START_NS = 1_790_000_000_000_000_000
-SCENARIO_TOML = 'name = "test"  # é\n'
-
 ENVIRONMENT = os.environ | {
     "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 }
-
-Sent = list[tuple[str, bytes, int]]
-"""(topic, payload, arrival)"""
-
-
-def traffic(steps: int, nodes: tuple[int, ...] = (1, 2)) -> Sent:
-    """What two nodes and the truth put on their keys, and when it came, 7 us after it was sent."""
-    random = np.random.default_rng(5)
-    sent: Sent = []
-    for step in range(1, steps + 1):
-        at = START_NS + step * 1_000_000
-        truth = Message(TRUTH_SENDER, step, "truth", step - 1, 1, at, {"x": random.normal(size=2)})
-        sent.append((keys.truth_key("r"), encode(truth), at + 7_000))
-        for node in nodes:
-            contents: dict[str, dict[str, object]] = {
-                "measurement": {"y": random.normal(size=1) if step % 3 else None},
-                "estimate": {"x": random.normal(size=2), "P": random.normal(size=(2, 2)), "used": (1,), "excluded": ()},
-            }
-            for stage, fields in contents.items():
-                message = Message(node, step, stage, step - 1, 1, at, fields)
-                sent.append((keys.stage_key("r", node, stage), encode(message), at + 7_000))
-    return sent
-
-
-def open_writer(path: Path, **more: Any) -> RecordingWriter:
-    return RecordingWriter(path, scenario_toml=SCENARIO_TOML, run="r", method="two_stage", seed=7, **more)
-
-
-def record(path: Path, sent: Sent, flush_every: int = 10**9, **more: Any) -> Path:
-    with open_writer(path, **more) as writer:
-        for number, message in enumerate(sent):
-            writer.write(*message)
-            if number % flush_every == flush_every - 1:
-                writer.flush()
-    return path
-
-
-def contents(recording: Recording) -> Sent:
-    return [(r.topic, r.data, r.log_time_ns) for r in recording.records()]
-
-
-def read(path: Path) -> Sent:
-    with Recording.open(path) as recording:
-        return contents(recording)
-
 
 # --- what is on the file ----------------------------------------------------------------------------------------
 
@@ -241,7 +194,7 @@ def test_a_disk_that_fills_up_costs_what_came_after(tmp_path: Path) -> None:
 
 FULL = """
 import resource, signal, sys
-from test_recording import open_writer, traffic
+from recordings import open_writer, traffic
 from zfusion.errors import RunError
 from pathlib import Path
 
@@ -270,7 +223,7 @@ except RunError as error:
 
 KILLED = """
 import sys
-from test_recording import open_writer, traffic
+from recordings import open_writer, traffic
 from pathlib import Path
 
 writer = open_writer(Path(sys.argv[1]))

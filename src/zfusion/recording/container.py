@@ -76,10 +76,11 @@ _Bytes = bytes | mmap.mmap
 
 
 class Damage(RecordingError):
-    """A file that is not what was written; `position` is the byte where that shows."""
+    """A file that is not what was written; `position` is the byte where that shows, `what` says how."""
 
     def __init__(self, position: int, what: str) -> None:
         self.position = position
+        self.what = what
         super().__init__(f"damaged at byte {position}: {what}")
 
 

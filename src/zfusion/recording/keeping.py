@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from os import fdatasync
 from pathlib import Path
 from typing import Self
 
@@ -53,12 +53,11 @@ class Syncer:
     What was flushed longer ago than the interval, and the time it takes, survives a power cut.
     """
 
-    def __init__(self, interval_ns: int, fdatasync: Callable[[int], None] = os.fdatasync) -> None:
-        """`fdatasync` is what puts the file of a descriptor on the disk."""
+    def __init__(self, interval_ns: int) -> None:
         self.failure: OSError | None = None
         """What the disk said; nothing is synced any more then."""
         self.count = 0
-        self._interval_s, self._fdatasync = interval_ns / 1e9, fdatasync
+        self._interval_s = interval_ns / 1e9
         self._wake = threading.Condition()
         self._current: int | None = None
         self._retired: list[int] = []
@@ -102,7 +101,7 @@ class Syncer:
     def _sync(self, descriptor: int) -> None:
         try:
             if self.failure is None:
-                self._fdatasync(descriptor)
+                fdatasync(descriptor)
                 self.count += 1
         except OSError as error:
             self.failure = error

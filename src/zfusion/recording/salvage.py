@@ -140,7 +140,7 @@ class Salvage:
         except Damage as damage:
             # What is in a block that has its length, and damage, is payload, whatever it looks like.
             bounded = opcode == Opcode.CHUNK and is_well_formed(self._data, end)
-            return (end if bounded else start + 1), str(damage)
+            return (end if bounded else start + 1), damage.what
         return end, ""
 
     def _chunk(self, frame: Frame) -> None:
