@@ -117,4 +117,4 @@ def _provable(steps: range | None, nodes: Collection[str] | None) -> str:
         return f"estimates cannot be recomputed from it, for they rest on the steps before {steps.start}"
     if nodes is not None:
         return "only estimates of nodes all of whose neighbours are on it can be recomputed"
-    return "its estimates can be recomputed, but for the last step's"
+    return "its estimates can be recomputed"
