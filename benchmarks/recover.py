@@ -2,7 +2,8 @@
 
     python benchmarks/recover.py [--steps N] [--json]
 
-All on the same simulated recording of the four-sensor example, in turn, in one process; recover on a copy with a damaged block.
+All on the same simulated recording of the four-sensor example, in turn, in one process; recover on a copy with a
+damaged block.
 """
 
 from __future__ import annotations

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
@@ -33,6 +34,9 @@ PATIENCE_S = 90.0
 POLL_S = 0.01
 
 ZFUSION = (sys.executable, "-m", "zfusion")
+
+MORTAL = ("setpriv", "--pdeathsig", "KILL", "--") if shutil.which("setpriv") else ()
+"""Words before a command that have it end with who started it: a test process that is killed leaves no swarm behind."""
 
 _numbers = count(1)
 
@@ -85,14 +89,17 @@ class Result:
 class Command:
     """A zfusion command that runs, in a directory of its own making."""
 
-    def __init__(self, directory: Path, *words: object, limit_bytes: int | None = None) -> None:
+    def __init__(
+        self, directory: Path, *words: object, program: Sequence[object] = ZFUSION, limit_bytes: int | None = None
+    ) -> None:
         """`limit_bytes` is how large a file it may write, as on a full disk."""
         number = next(_numbers)
         self._out, self._err = (directory / f"command{number}.{name}" for name in ("out", "err"))
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
+        limit = [] if limit_bytes is None else ["prlimit", f"--fsize={limit_bytes}"]
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [*([] if limit_bytes is None else ["prlimit", f"--fsize={limit_bytes}"]), *ZFUSION, *map(str, words)],
+                [*MORTAL, *limit, *map(str, program), *map(str, words)],
                 cwd=directory,
                 stdout=out,
                 stderr=err,
@@ -103,6 +110,11 @@ class Command:
     def said(self) -> str:
         """What it has said on standard error so far."""
         return self._err.read_text()
+
+    @property
+    def heard(self) -> bool:
+        """Whether it has said anything on standard output."""
+        return self._out.stat().st_size > 0
 
     def interrupt(self) -> None:
         """Ctrl-C."""

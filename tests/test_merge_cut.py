@@ -198,7 +198,7 @@ def test_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
         cut(path, tmp_path / "c.mcap", nodes=["1"])
 
     random, peaks = Random(1), []
-    for number in (100, 800):
+    for number in (400, 1200):
         sent = []
         for n in range(number):
             payload = {"v": 1, "node": 1, "step": n + 1, "t_ns": 1, "seq": n, "born": 1, "y": random.randbytes(10_000)}

@@ -29,8 +29,7 @@ from zfusion import gaps as gaps_module
 from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
-from zfusion.recording import GapCounter, Gaps, Record, Recording, arithmetic_differences
-from zfusion.recording import segment as segment_module
+from zfusion.recording import GapCounter, Gaps, Record, Recording, arithmetic_differences, layout
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info
 from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed
@@ -166,7 +165,7 @@ def test_finishing_twice_is_finishing_once(tmp_path: Path) -> None:
 
 
 def test_a_file_holds_so_many_topics_and_counts_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segment_module, "MAX_TOPICS", 2)
+    monkeypatch.setattr(layout, "MAX_TOPICS", 2)
     sent = [(f"zfusion/r/node/{n}/estimate", b"\x80", 1) for n in (1, 2, 3, 2)]
     with Recording.open(record(tmp_path / "r.mcap", sent)) as recording:
         assert [r.topic[-10] for r in recording.records()] == ["1", "2", "2"]

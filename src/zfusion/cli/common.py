@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from zfusion.cli import logs
 from zfusion.errors import InputError, ZfusionError
 from zfusion.keys import check_run
 from zfusion.methods.check import check_method
@@ -44,6 +45,10 @@ Loss = Annotated[
 RunName = Annotated[str | None, typer.Option("--run", help="Name of the run.", show_default="made up")]
 Connect = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to dial; may be repeated.")]
 Listen = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on; may be repeated.")]
+ZenohConfig = Annotated[
+    Path | None,
+    typer.Option("--zenoh-config", help="This process' Zenoh configuration.", show_default="the scenario's"),
+]
 ControlFd = Annotated[int | None, typer.Option(hidden=True)]
 
 
@@ -57,6 +62,7 @@ def load(
     links: Path | None = None,
     loss: float | None = None,
     delay: float | None = None,
+    zenoh_config: Path | None = None,
 ) -> Scenario:
     """The scenario of a file with what the command line says instead; InputError for what is wrong with it.
 
@@ -73,12 +79,17 @@ def load(
         links=links,
         loss=loss,
         delay=delay,
+        zenoh_config=zenoh_config,
     )
     loaded = load_scenario(path, **overrides)
     check_method(loaded, str(path))
     links_of(loaded)
     for n in Timeline(loaded).beyond(loaded.steps):
-        err.print(f"faults[{n}] begins after the last step, {loaded.steps}: it will not happen")
+        said = f"faults[{n}] begins after the last step, {loaded.steps}: it will not happen"
+        if logs.as_json():
+            logs.log.warning(said)
+        else:
+            err.print(said)
     return loaded
 
 

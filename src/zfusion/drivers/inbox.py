@@ -188,7 +188,7 @@ class Inbox:
         for record in stack.records:
             if record.point == zenoh.InterceptionPoint.RECEIVE:
                 stamp: int = record.timestamp().get_time_as_ntp64().as_nanos()
-                return stamp + self._clock.ahead_ns
+                return self._clock.of_machine(stamp)
         return None
 
     def _watch(self) -> None:

@@ -10,7 +10,8 @@ not to suffer from its recorder.
 
 from __future__ import annotations
 
-import time
+import logging
+import platform
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,25 +21,33 @@ from typing import Any
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import Clock
+from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError, RecordingError, RunError
 from zfusion.gaps import Gaps
-from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
+from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording.reader import Recording
 from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, TRUTH_SENDER, Stage
+from zfusion.status import RecorderStatus
+
+log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
 """Messages that wait for the disk where senders wait when it is full: seconds of a large swarm, tens of MB."""
 
 GRACE_NS = 4_000_000_000
 """How long nodes that vanished without a word may come back: a recorder that stood still finds all links broken."""
+
+MAX_NOTICES = 65_536
+"""Questions and news of nodes that wait; beyond it they are dropped, and counted: whoever asks can ask again."""
 
 CHANNEL = "all"
 
@@ -91,9 +100,13 @@ class Recorder:
             endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
+            name=RECORDER_NAME,
         )
-        self._inbox = Inbox(self._session)
-        writer.is_legal = self.is_legal
+        self._clock = Clock()
+        self._clock.keep()
+        self._inbox = Inbox(self._session, self._clock)
+        writer.accounts.is_legal = self.is_legal
+        writer.accounts.is_topic = self._topics.__contains__
 
     def run(self) -> RecorderReport:
         """Record; the file is finished when this returns, whatever ends it. What could not be written is told."""
@@ -130,19 +143,27 @@ class Recorder:
         ]
 
     def _note(self, kind: str, about: Any) -> None:
-        self._inbox.notify((kind, about))
+        if len(self._inbox.notices) < MAX_NOTICES:
+            self._inbox.notify((kind, about))
+            return
+        self._report.unheeded += 1
+        if kind == "status?":
+            about.drop()
 
     def _record(self) -> None:
         inbox = self._inbox
-        next_flush = time.time_ns() + self._flush_ns
+        next_flush = self._clock.now() + self._flush_ns
         while True:
-            if not self._take() and not self._waits:
+            if self._waits:
+                sample = inbox.wait_sample(CHANNEL, next_flush)
+                if sample is not None:
+                    self._receive(str(sample.key_expr), sample.payload, self._clock.now())
+            elif not self._take():
                 inbox.rest(next_flush, or_posted=True)
-            elif self._waits and (sample := inbox.wait_sample(CHANNEL, next_flush)) is not None:
-                self._receive(str(sample.key_expr), sample.payload, time.time_ns())
-            now = time.time_ns()
+            now = self._clock.now()
             if now >= next_flush:
                 next_flush = now + self._flush_ns
+                self._clock.look()
                 self._try(self._writer.flush)
                 if self._tell is not None:
                     self._tell(self._count())
@@ -228,11 +249,25 @@ class Recorder:
             if kind == "token":
                 self._on_token(about)
             else:
-                self._drain()  # the asker's messages came before its question
-                report = self._count()
-                told = {name: getattr(report, name) for name in ("messages", "unrecorded", "overrun", "stopped")}
-                with about:  # queries are to be dropped explicitly, see `live.QUESTIONS`
-                    about.reply(keys.recorder_status_key(self._run), encode_any(told))
+                self._answer(about)
+
+    def _answer(self, query: Any) -> None:
+        """Tell what is on the file, and how much waited for it."""
+        waiting = self._drain()  # the asker's messages came before its question
+        report = self._count()
+        status = RecorderStatus(
+            messages=report.messages,
+            foreign=report.foreign,
+            lost=sum(self._writer.lost().values()),
+            waiting=waiting,
+            unrecorded=report.unrecorded,
+            overrun=report.overrun,
+            stopped=report.stopped,
+            path=report.path,
+            host=platform.node(),
+        )
+        with query:  # queries are to be dropped explicitly, see `presence.QUESTIONS`
+            query.reply(keys.recorder_status_key(self._run), status.encode())
 
     def _all_gone(self, now: int) -> bool:
         """Whether all nodes have come and gone: with a word, or for good."""
@@ -242,16 +277,18 @@ class Recorder:
         self._empty_since = self._empty_since or now
         return self._left >= self._ids or now >= self._empty_since + GRACE_NS
 
-    def _drain(self) -> None:
-        """Write what is there by now."""
-        for _ in range(max(CAPACITY, len(self._inbox.posted))):
+    def _drain(self) -> int:
+        """Write what is there by now; how many messages that was."""
+        most = max(CAPACITY, len(self._inbox.posted))
+        for number in range(most):
             if self._waits:
                 sample = self._inbox.poll_sample(CHANNEL)
                 if sample is None:
-                    return
-                self._receive(str(sample.key_expr), sample.payload, time.time_ns())
+                    return number
+                self._receive(str(sample.key_expr), sample.payload, self._clock.now())
             elif not self._take():
-                return
+                return number
+        return most
 
     def _on_token(self, sample: Any) -> None:
         try:
@@ -265,8 +302,10 @@ class Recorder:
             self._seen.add(node)
             self._present.add(node)
             self._left.discard(node)
+            log.info("node %s is there", node)
         else:
             self._present.discard(node)
+            log.info("node %s is gone", node)
 
     def _finish(self) -> None:
         report, facts = self._count(), {"foreign": str(self._report.foreign), "overrun": str(self._inbox.overrun)}
@@ -283,6 +322,7 @@ class Recorder:
         for key, topic in self._topics.items():
             if topic.received > topic.recorded:
                 report.lost[key] = report.lost.get(key, 0) + topic.received - topic.recorded
+        log.info("%d messages in %s", report.messages, report.path)
 
     def _recount(self) -> None:
         """What was written last may not have come to the disk when that failed: see what is there."""

@@ -8,12 +8,14 @@ liveliness tokens say who is there (docs/live.md).
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 import stat
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,39 +26,35 @@ os.environ.setdefault(
 
 import zenoh
 
+from zfusion.drivers.credentials import RENEW, Credentials, prove
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.settings import base_settings
 from zfusion.errors import InputError
 
-RETRY = {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}
-"""A neighbour that comes up soon is linked within 20 ms, one that was away for long within a quarter of a second."""
+log = logging.getLogger(__name__)
 
-LEASE_MS = 2000
-"""A peer that neither closes nor answers (stopped, cut off) counts as gone after this; one that dies, at once."""
-
-BLOCK_US = 60_000_000
-"""How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer
-is slower than we are, which is no reason to lose its messages."""
-
-MAX_RECEIVED = 16 << 20
-"""Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times
-what zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
-
-LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
-"""About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
-
+SOON = timedelta(days=14)
+"""How long before it expires a certificate is spoken of."""
 
 RECEIPT = zenoh.TimestampInstrumentationBuilder().set_receive(True).build()
 """Has the receiving session stamp a message when it comes: 5 to 10 µs of work at each end."""
 
 
 def open_session(
-    endpoints: Endpoints, *, low_latency: bool = False, config_file: Path | None = None, mode: str = "peer"
+    endpoints: Endpoints,
+    *,
+    low_latency: bool = False,
+    config_file: Path | None = None,
+    mode: str = "peer",
+    name: str | None = None,
 ) -> zenoh.Session:
     """An open Zenoh session; InputError, naming the endpoint or file, where Zenoh refuses it.
 
-    A user's `config_file` comes first; the endpoints, where given, replace its own.
+    A user's `config_file` comes first; the endpoints, where given, replace its own. Where it has certificates they are
+    proven first, as those of `name` where there are rules about names.
     """
     config = _base_config(config_file, mode, low_latency)
+    _prove(config, name)
     if endpoints.listen:
         config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
     if endpoints.connect:
@@ -111,25 +109,19 @@ def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zeno
         config.insert_json5("timestamping/enabled", "true")
         return config
     config = zenoh.Config()
-    settings = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 1,  # nothing is scouted: do not wait for it
-        "listen/endpoints": [],
-        "connect/endpoints": [],
-        "connect/timeout_ms": -1,  # keep trying, in the background
-        "connect/exit_on_failure": False,
-        "connect/retry": RETRY,
-        "timestamping/enabled": True,
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
-        "transport/link/rx/max_message_size": MAX_RECEIVED,
-        "transport/shared_memory/enabled": False,
-    }
-    for key, value in (settings | (LOW_LATENCY if low_latency else {})).items():
+    for key, value in base_settings(mode, low_latency=low_latency).items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _prove(config: zenoh.Config, name: str | None) -> None:
+    """See that the certificates of a configuration are good, before Zenoh waits with them for ever."""
+    by_names = json.loads(config.get_json("access_control/enabled"))
+    for credentials in Credentials.of(json.loads(config.get_json("transport/link/tls"))):
+        proven = prove(credentials, common_name=name if by_names else None)
+        left = proven.ends - datetime.now(UTC)
+        if left < SOON:
+            log.warning("%s expires in %d days: %s", credentials.certificate, left.days, RENEW)
 
 
 def _listed(endpoints: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +74,7 @@ class Overrides(TypedDict, total=False):
     links: str | Path | None
     loss: float | None
     delay: float | None
+    zenoh_config: str | Path | None
 
 
 class Scenario(Spec):
@@ -97,6 +98,7 @@ class Scenario(Spec):
 
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _origin: str = PrivateAttr(default="scenario")
+    _design: bytes | None = PrivateAttr(default=None)
 
     @classmethod
     def from_toml(cls, text: str, source: str = "scenario", directory: Path | None = None) -> Self:
@@ -202,21 +204,32 @@ class Scenario(Spec):
 
     def anchored(self) -> Self:
         """The same scenario with absolute paths, to be written to another directory."""
+        return self.with_paths(lambda path: str(self.absolute(path)))
 
-        def here(path: str) -> str:
-            return str(self.absolute(path))
-
+    def with_paths(self, changed: Callable[[str], str]) -> Self:
+        """The same with every path in it replaced by what `changed` makes of it."""
         sensors = tuple(
-            sensor.model_copy(update={"source": sensor.source.with_paths(here)}) if sensor.source else sensor
+            sensor.model_copy(update={"source": sensor.source.with_paths(changed)}) if sensor.source else sensor
             for sensor in self.sensors
         )
         pieces = {
-            name: getattr(self, name).with_paths(here)
+            name: getattr(self, name).with_paths(changed)
             for name in ("source", "transport", "recording", "links", "method")
         }
-        changed = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
-        document = self._document() | changed | {"sensors": sensors}
+        others = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
+        document = self._document() | others | {"sensors": sensors}
         return self._from_document(document, self._origin, self._directory)
+
+    def carrying(self, design: bytes | None) -> Self:
+        """The same scenario with the content of its design file, which then is read nowhere; None: without."""
+        scenario = self._from_document(self._document(), self._origin, self._directory)
+        scenario._design = design
+        return scenario
+
+    @property
+    def carried_design(self) -> bytes | None:
+        """What `carrying` gave it; what is made of it by other means carries nothing."""
+        return self._design
 
     def with_overrides(self, **overrides: Unpack[Overrides]) -> Self:
         """The scenario with these in the place of what it says; ScenarioError if that cannot be."""
@@ -264,7 +277,9 @@ class Scenario(Spec):
         facts = self.method.with_paths(_file_name).model_dump(exclude_none=True)
         if self.method.design is not None:
             with suppress(OSError):  # whoever reads it as a design says so
-                facts["design"] = hashlib.sha256(self.absolute(self.method.design).read_bytes()).hexdigest()
+                carried = self._design
+                content = self.absolute(self.method.design).read_bytes() if carried is None else carried
+                facts["design"] = hashlib.sha256(content).hexdigest()
         return facts
 
     def _sensor_facts(self, i: NodeId) -> dict[str, Any]:
@@ -350,6 +365,9 @@ def _overridden(document: Mapping[str, Any], overrides: Overrides) -> dict[str, 
     links = changed.get("links", {})
     if of_links and isinstance(links, Mapping):
         changed["links"] = {**links, **of_links}
+    transport = document.get("transport", {})
+    if "zenoh_config" in given and isinstance(transport, Mapping):
+        changed["transport"] = {**transport, "zenoh_config": str(Path(str(given["zenoh_config"])).absolute())}
     method = document.get("method")
     if "method" in given and given["method"] != (method.get("name") if isinstance(method, Mapping) else method):
         changed["method"] = {"name": given["method"]}

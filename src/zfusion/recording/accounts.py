@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
 from zfusion.errors import MessageError
-from zfusion.gaps import GapCounter, Gaps
+from zfusion.gaps import MAX_LIVES, GapCounter, Gaps
 from zfusion.messages import Stamp, decode_any, read_stamp
-from zfusion.recording.layout import unsealed
+from zfusion.recording.layout import MAX_TOPICS, unsealed
 from zfusion.stages import EVENT, TRUTH
 
 _UNKNOWN = Stamp(0, 0, 0, 0)
@@ -22,6 +22,8 @@ class Accounts:
     def __init__(self) -> None:
         self.is_legal: Callable[[str, bytes], bool] = lambda _topic, _data: True
         """Asked where counters are not the next in order: what is not legal does not count."""
+        self.is_topic: Callable[[str], bool] = lambda _topic: True
+        """Asked of topics of which a sender says how much it had sent."""
         self._counters: dict[str, GapCounter] = {}
         self._sent: dict[str, dict[int, int]] = {}
 
@@ -68,7 +70,13 @@ class Accounts:
         for stage, count in sent.items():
             if isinstance(count, int) and isinstance(stage, str):
                 key = f"{run}/{TRUTH.name}" if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
-                self._sent.setdefault(key, {})[event["born"]] = count
+                self._note_total(key, event["born"], count)
+
+    def _note_total(self, topic: str, born: int, count: int) -> None:
+        if self.is_topic(topic) and (topic in self._sent or len(self._sent) < MAX_TOPICS):
+            lives = self._sent.setdefault(topic, {})
+            if born in lives or len(lives) < MAX_LIVES:
+                lives[born] = count
 
 
 def stated_accounts(metadata: Mapping[str, str]) -> dict[str, Gaps]:

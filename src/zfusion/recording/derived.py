@@ -28,19 +28,27 @@ OF_ITS_PLACE = (layout.IDENTITY, layout.SEGMENT, layout.PREVIOUS)
 class DerivedWriter:
     """A file that is being made from others. A context manager: without `finish` there is no file in the end.
 
-    `facts` and `scenario_toml` are the originals'; `inputs` are files that must not be replaced. InputError if
-    `output` is one of them; RecordingError if it cannot be made; RunError when writing fails.
+    `facts`, `scenario_toml` and `design` are the originals'; `inputs` are files that must not be replaced. InputError
+    if `output` is one of them; RecordingError if it cannot be made; RunError when writing fails.
     """
 
     def __init__(
-        self, output: Path, inputs: Iterable[Path], facts: Mapping[str, str], scenario_toml: str, describe: Describe
+        self,
+        output: Path,
+        inputs: Iterable[Path],
+        facts: Mapping[str, str],
+        scenario_toml: str,
+        describe: Describe,
+        design: bytes | None = None,
     ) -> None:
         for path in inputs:
             if output.exists() and path.exists() and output.samefile(path):
                 raise InputError(f"{output}: is one of the recordings that are read")
         self.path = output
         self.accounts = Accounts()
-        self._segment = SegmentWriter(output.with_name(output.name + PART), facts, scenario_toml, describe)
+        self._segment = SegmentWriter(
+            output.with_name(output.name + PART), facts, scenario_toml, describe, design=design
+        )
         try:
             output.parent.mkdir(parents=True, exist_ok=True)
             self._segment.open()

@@ -117,6 +117,7 @@ class RecordedFile:
         self.number = int(self.metadata.get(layout.SEGMENT, "0"))
         """Its place among the segments."""
         self.scenario_toml = contents.attachments[layout.SCENARIO].decode()
+        self.design = contents.attachments.get(layout.DESIGN)
         channels = dict(sorted(contents.channels.items()))
         self.topics: Mapping[str, int] = {c.topic: contents.counts.get(c.id, 0) for c in channels.values()}
         """Messages of every topic, in the order in which the topics first appeared."""

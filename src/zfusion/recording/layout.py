@@ -2,6 +2,7 @@
 
 Metadata  zfusion.recording   first record of the file: format, run, method, seed, versions, machine, clocks; segment
 Attachment scenario.toml      the scenario
+Attachment design.npz         the design of its method, where that is designed off-line
 Chunks                        one channel per Zenoh key; message data are the wire bytes
 Metadata  zfusion.channels    again and again: what the channels are, and from time to time the two above once more
 Metadata  zfusion.derived     in a file made from others: how, of which, and what is not on it
@@ -35,7 +36,13 @@ CLOSE = "zfusion.close"
 SCENARIO = "scenario.toml"
 SCENARIO_TYPE = "application/toml"
 
+DESIGN = "design.npz"
+DESIGN_TYPE = "application/zip"
+
 CHECKSUM = "checksum"
+
+MAX_TOPICS = 65_535
+"""What an MCAP file can name; a run with more keys is an attack."""
 
 IDENTITY = "recording"
 """Fact: the same in all segments of a recording, and in no other recording."""

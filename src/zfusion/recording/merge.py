@@ -106,7 +106,8 @@ def merge(sources: Sequence[Path], output: Path, advance: Callable[[int], None] 
         for recording in reversed(recordings):
             descriptions |= recording.descriptions
         files = [file for recording in recordings for file in recording.files]
-        with DerivedWriter(output, files, facts, first.scenario_toml, descriptions.__getitem__) as writer:
+        of = descriptions.__getitem__
+        with DerivedWriter(output, files, facts, first.scenario_toml, of, first.design) as writer:
             counts, conflicting = _copy(recordings, writer, advance)
             alone = len(recordings) == 1 and first.statistics is not None
             statistics = first.statistics if alone and first.statistics is not None else writer.accounts.gaps()

@@ -42,6 +42,8 @@ class Recording:
         self.derived: Mapping[str, str] = first.derived
         """How it was made from other recordings; empty if it was not."""
         self.scenario_toml = first.scenario_toml
+        self.design = first.design
+        """What the file of the method's design held; None where it has none, or nobody attached it."""
         self.topics: Mapping[str, int] = {
             topic: sum(file.topics.get(topic, 0) for file in files)
             for topic in dict.fromkeys(topic for file in files for topic in file.topics)

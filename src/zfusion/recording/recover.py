@@ -90,7 +90,8 @@ def _recover(source: Path, file: BinaryIO, output: Path, advance: Callable[[int]
         raise RecordingError(f"is a recording of format {facts.get('format')}; this zfusion reads {layout.FORMAT}")
     known = _known_channels(found)
     descriptions = {channel.topic: described(channel, found.schemas) for channel in known.values()}
-    with DerivedWriter(output, [source], facts, found.scenario_toml, descriptions.__getitem__) as writer:
+    of = descriptions.__getitem__
+    with DerivedWriter(output, [source], facts, found.scenario_toml, of, found.design) as writer:
         for place in found.places:
             for record in _records(file, place, known, found):
                 writer.add(record)

@@ -40,7 +40,7 @@ NAMED = 1000
 
 _CANDIDATE = re.compile(
     rb"\x06(?=.{36}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0))"  # a chunk, by its compression
-    rb"|\x09(?=.{24}\x0d\0\0\0scenario\.toml)"
+    rb"|\x09(?=.{24}(?:\x0d\0\0\0scenario\.toml|\x0a\0\0\0design\.npz))"
     rb"|\x0c(?=.{8}.\0\0\0zfusion\.)",
     re.DOTALL,
 )
@@ -75,6 +75,7 @@ class Found:
     """By channel."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     scenario_toml: str | None = None
+    design: bytes | None = None
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     disputed: set[int] = field(default_factory=set)
@@ -160,6 +161,8 @@ class Salvage:
         attachment: Attachment = parse_attachment(frame)
         if attachment.name == layout.SCENARIO:
             self._note_scenario(attachment.data.decode())
+        elif attachment.name == layout.DESIGN:
+            self._found.design = attachment.data
 
     def _metadata(self, frame: Frame) -> None:
         metadata = parse(Metadata, frame)

@@ -17,9 +17,6 @@ from zfusion.recording.channels import Describe, Description, Table, to_metadata
 CHUNK_BYTES = 1 << 20
 """Messages are compressed in blocks of this size: 4 % smaller files than blocks of 64 KiB, 5 ms to close one."""
 
-MAX_TOPICS = 65_535
-"""What an MCAP file can name; a run with more keys is an attack."""
-
 TABLE_EVERY_BYTES = 8 << 20
 """How often the facts, the scenario and all channels are repeated: what is lost with them is bounded by this."""
 
@@ -33,7 +30,8 @@ MESSAGE_OVERHEAD = 31
 class SegmentWriter:
     """A file of a recording that is being written; there is none until it is opened.
 
-    `facts` are all that it says of itself, `scenario_toml` what was run.
+    `facts` are all that it says of itself, `scenario_toml` what was run, `design` what the file of the method's design
+    holds.
     """
 
     def __init__(
@@ -43,12 +41,14 @@ class SegmentWriter:
         scenario_toml: str,
         describe: Describe,
         *,
+        design: bytes | None = None,
         compression: str = "zstd",
         stride_bytes: int = STRIDE_BYTES,
     ) -> None:
         self.path = path
         self.messages = 0
         self._facts, self._scenario_toml, self._describe = layout.unsealed(facts), scenario_toml, describe
+        self._design = design
         self._stride = min(STRIDE_BYTES, stride_bytes)
         self._numbers: dict[str, int] = {}
         self._channels: list[Channel] = []
@@ -74,16 +74,15 @@ class SegmentWriter:
         now = int(self._facts.get("clock_realtime_ns", 0)) or time.time_ns()
         self._writer.start(profile=layout.PROFILE)
         self._writer.add_metadata(layout.RECORDING, layout.sealed(self._facts))
-        self._writer.add_attachment(
-            create_time=now,
-            log_time=now,
-            name=layout.SCENARIO,
-            media_type=layout.SCENARIO_TYPE,
-            data=self._scenario_toml.encode(),
-        )
+        self._attach(now, layout.SCENARIO, layout.SCENARIO_TYPE, self._scenario_toml.encode())
+        if self._design is not None:
+            self._attach(now, layout.DESIGN, layout.DESIGN_TYPE, self._design)
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._measure()
         self._table_at = self._written
+
+    def _attach(self, now: int, name: str, media_type: str, data: bytes) -> None:
+        self._writer.add_attachment(create_time=now, log_time=now, name=name, media_type=media_type, data=data)
 
     @property
     def closed(self) -> bool:
@@ -101,7 +100,7 @@ class SegmentWriter:
 
     def takes(self, topic: str) -> bool:
         """Whether the file can hold messages of that topic: it cannot name any number of them."""
-        return topic in self._numbers or len(self._channels) < MAX_TOPICS
+        return topic in self._numbers or len(self._channels) < layout.MAX_TOPICS
 
     def add(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
         """Put a message on the file, of a topic that it takes."""

@@ -8,7 +8,7 @@ that gets too large, or too long, goes on in another file (`layout`).
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -29,10 +29,11 @@ class RecordingWriter:
     """An open recording. A context manager: leaving it finishes the file.
 
     `path` must be in a directory that is there; a file there is replaced. `stages` are those of the method beside the
-    built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `facts` are what
-    else the caller knows of the run and wants on the file; `keeping` says when files are changed and when to stop.
-    RecordingError if the file cannot be made, or there is no room for it; RunError from any method when writing fails
-    (disk full): the file is closed then, and readable up to there.
+    built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `design` is what the
+    file of the method's design holds. `facts` are what else the caller knows of the run and wants on the file;
+    `keeping` says when files are changed and when to stop. RecordingError if the file cannot be made, or there is no
+    room for it; RunError from any method when writing fails (disk full): the file is closed then, and readable up to
+    there.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class RecordingWriter:
         method: str,
         seed: int | None,
         stages: Iterable[Stage] = (),
+        design: bytes | None = None,
         facts: Mapping[str, str] | None = None,
         keeping: Keeping | None = None,
     ) -> None:
@@ -55,9 +57,10 @@ class RecordingWriter:
         """Why nothing is written any more, where something was asked for that ends a recording."""
         self.unrecorded = 0
         """Messages that came after that."""
-        self._accounts = Accounts()
+        self.accounts = Accounts()
+        """What came of what was sent."""
         self._keeping = keeping or Keeping()
-        self._scenario_toml, self._describe = scenario_toml, by_stages(stages)
+        self._scenario_toml, self._design, self._describe = scenario_toml, design, by_stages(stages)
         self._stride = min(STRIDE_BYTES, (self._keeping.rotate_bytes or STRIDE_BYTES) // 8)
         self._until_look = 0
         """Bytes until it is looked again what room there is."""
@@ -85,15 +88,6 @@ class RecordingWriter:
         self._watch()
 
     @property
-    def is_legal(self) -> Callable[[str, bytes], bool]:
-        """Asked, with topic and payload, where counters are not the next in order: what is not legal does not count."""
-        return self._accounts.is_legal
-
-    @is_legal.setter
-    def is_legal(self, judge: Callable[[str, bytes], bool]) -> None:
-        self._accounts.is_legal = judge
-
-    @property
     def files(self) -> tuple[Path, ...]:
         """The files that are there, in order."""
         return tuple(self._kept)
@@ -119,7 +113,7 @@ class RecordingWriter:
             if not self._segment.takes(topic):
                 self._refused += 1
                 return
-            stamp = self._accounts.observe(topic, data)
+            stamp = self.accounts.observe(topic, data)
             self._segment.add(topic, data, log_time, stamp.t_ns or log_time, stamp.seq & 0xFFFF_FFFF)
         self.messages += 1
 
@@ -135,6 +129,10 @@ class RecordingWriter:
             if self.stopped:
                 self._close({layout.STOPPED: self.stopped})
 
+    def lost(self) -> dict[str, int]:
+        """By topic: what is missing so far between the messages that came, where anything is."""
+        return {topic: gaps.lost_between for topic, gaps in self.accounts.gaps().items() if gaps.lost_between}
+
     def finish(
         self,
         *,
@@ -146,7 +144,7 @@ class RecordingWriter:
         `sent` tells, for the topics whose senders' own last words do not, how many messages they had put there, by
         their lives' first steps; `facts` are what the caller knows of how the run ended (queue, drops).
         """
-        accounts = self._accounts.gaps(sent)
+        accounts = self.accounts.gaps(sent)
         if not self._segment.closed:
             with self._writing():
                 self._close(facts or {}, accounts)
@@ -196,6 +194,7 @@ class RecordingWriter:
             self._facts | start | place,
             self._scenario_toml,
             self._describe,
+            design=self._design,
             compression=self._keeping.compression,
             stride_bytes=self._stride,
         )
@@ -220,7 +219,7 @@ class RecordingWriter:
     def _close(self, facts: Mapping[str, str], accounts: Mapping[str, Gaps] | None = None) -> None:
         """Finish the file that is open."""
         if accounts is None:
-            accounts = self._accounts.gaps()
+            accounts = self.accounts.gaps()
         counts = {"messages": self.messages, layout.IN_SEGMENT: self._segment.messages, "refused": self._refused}
         end = clocks() | {name: str(count) for name, count in counts.items()} | dict(facts)
         self._segment.finish({layout.STATISTICS: to_state(accounts), layout.CLOSE: end})

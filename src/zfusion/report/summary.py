@@ -35,6 +35,10 @@ HEADINGS = {"intermediate": "intermed."}
 
 
 TOLD_OF_RECORDER = ("files", "unrecorded", "overrun", "foreign", "stopped")
+"""Of its report."""
+
+CLOCK_COUNTERS = ("clock_jumps", "clock_offset_exceeded")
+"""Of the nodes' reports."""
 
 LATE_FATES = {"revised": "taken in", "too_late": "beyond the window", "stale": "of no use any more"}
 """What becomes of late messages where nodes revise, in words."""
@@ -76,7 +80,7 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    revised, too_late, stale (`EdgeCounters`), refused and incidents by name,
+    revised, too_late, stale (`EdgeCounters`), refused and incidents by name, clock_jumps and clock_offset_exceeded,
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
     recording, and what the recorder says of it (recorder, `RecorderReport`);
@@ -106,6 +110,7 @@ def summarize(
         "fallbacks": sum(report.fallbacks for report in lives),
         "incidents": _incidents(lives),
         "skipped": sum(report.skipped for report in lives),
+        **{name: sum(getattr(report, name) for report in lives) for name in CLOCK_COUNTERS},
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
         "latency_us": _quantiles(report.latency for report in lives),
@@ -136,8 +141,10 @@ def summarize(
 
 def notes_of(scenario: Scenario) -> list[str]:
     """What a user of the scenario's method must know of every run."""
-    note = chosen(scenario).family.note
-    return [note] if note else []
+    method = chosen(scenario)
+    note = method.family.note
+    warnings = method.family.warnings(method.options, scenario.system(), method.network(scenario.network))
+    return [*([note] if note else []), *warnings]
 
 
 def _edges(
@@ -335,6 +342,11 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
         console.print(
             f"{summary['rounds_per_s']:.1f} steps/s; measurement to estimate "
             f"{latency['p50']:.0f} µs (p50), {latency['p99']:.0f} µs (p99)"
+        )
+    if summary["clock_jumps"] or summary["clock_offset_exceeded"]:
+        console.print(
+            f"clocks: {summary['clock_jumps']} jumps seen by nodes; "
+            f"{summary['clock_offset_exceeded']} readings of neighbours' beyond the limit"
         )
     _show_misfortune(console, summary)
     show_latencies(console, summary, HEADINGS)

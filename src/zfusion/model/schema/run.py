@@ -66,6 +66,9 @@ class TimingSpec(Spec):
     `late` says what becomes of messages that are: they are not used (drop); they are not used in time, but taken in as
     long as they are within the `window` (revise); or there is no such thing, as a stage waits for all that it expects,
     for up to `timeout_s` (wait).
+
+    The clocks of two neighbours may be `max_clock_offset_s` apart, by default a quarter of the shortest time that a
+    stage is open; a node that finds more refuses to begin, or says so (`on_clock_offset`).
     """
 
     rate_hz: Positive | None = None
@@ -75,6 +78,8 @@ class TimingSpec(Spec):
     late: Literal["drop", "revise", "wait"] = "drop"
     window: Annotated[int, Field(strict=True, ge=1, le=LARGEST_WINDOW)] = 8
     epoch: Annotated[datetime, PlainValidator(_epoch)] | None = None
+    max_clock_offset_s: Positive | None = None
+    on_clock_offset: Literal["refuse", "warn"] = "refuse"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
