@@ -164,6 +164,12 @@ class RecorderStatus:
     """Messages that had come and were not on the file yet when the question was heard."""
     path: str
     host: str
+    unrecorded: int = 0
+    """Messages that came and could not be written."""
+    overrun: int = 0
+    """Messages that came and were dropped unread, being too much at once."""
+    stopped: str = ""
+    """Why nothing is written any more, if that is so."""
 
     def encode(self) -> bytes:
         """As bytes."""
@@ -174,8 +180,9 @@ class RecorderStatus:
         """From bytes; MessageError if they are no such status."""
         raw = decode_any(data)
         try:
-            counts = {name: _typed(raw, name, int) for name in ("messages", "foreign", "lost", "waiting")}
-            return cls(**counts, path=_typed(raw, "path", str), host=_typed(raw, "host", str))
+            counts = ("messages", "foreign", "lost", "waiting", "unrecorded", "overrun")
+            words = {name: _typed(raw, name, str) for name in ("path", "host", "stopped")}
+            return cls(**{name: _typed(raw, name, int) for name in counts}, **words)
         except KeyError as missing:
             raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -145,6 +146,17 @@ def epoch_ns(text: str) -> int:
     if epoch.tzinfo is None:
         raise InputError(f"--epoch: expected a time with its offset, like 2026-01-31T12:00:00Z (is {text!r})")
     return round(epoch.timestamp() * 1000) * 1_000_000
+
+
+def steps_range(text: str | None) -> range | None:
+    """``A:B``, both included, or ``A``; InputError for anything else."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", text)
+    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    if not 1 <= first <= last:
+        raise InputError(f"--steps: expected first:last, like 100:112 (is {text!r})")
+    return range(first, last + 1)
 
 
 def finish(result: Mapping[str, Any], as_json: bool, show: Callable[[], None]) -> None:

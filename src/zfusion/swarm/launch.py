@@ -172,6 +172,7 @@ class Launcher:
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
+            self._note_unrecorded()
         finally:
             self._kill(self._everybody())
             self._selector.close()
@@ -463,6 +464,12 @@ class Launcher:
         if self._recorder is None or not self._recorder.reports:
             return None
         return RecorderReport(**self._recorder.reports[-1])
+
+    def _note_unrecorded(self) -> None:
+        """A swarm goes on without its recording, but it has not been recorded as it was to be."""
+        report = self._recorder_report()
+        if report is not None and report.stopped:
+            self._failures.append(f"{report.stopped}: {report.unrecorded} messages are not on the recording")
 
     def _network_report(self) -> Mapping[str, Any] | None:
         """What it told at its end; of one that died before, what it was."""
