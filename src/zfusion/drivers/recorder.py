@@ -19,7 +19,7 @@ from zfusion import keys
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
-from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
+from zfusion.drivers.transport import closing, never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
 from zfusion.methods import chosen
@@ -82,7 +82,7 @@ class Recorder:
     def run(self) -> RecorderReport:
         """Record; the file is finished when this returns, whatever ends it. RunError when writing fails."""
         try:
-            with self._session:
+            with closing(self._session):
                 try:
                     self._declare()
                     self._record()

@@ -8,12 +8,13 @@ liveliness tokens say who is there (docs/live.md).
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 import stat
 import struct
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,6 +27,8 @@ import zenoh
 
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.errors import InputError
+
+log = logging.getLogger(__name__)
 
 RETRY = {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}
 """A neighbour that comes up soon is linked within 20 ms, one that was away for long within a quarter of a second."""
@@ -66,6 +69,22 @@ def open_session(
     except zenoh.ZError as error:
         where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
         raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+
+
+@contextmanager
+def closing(session: zenoh.Session) -> Iterator[None]:
+    """Close a session in the end.
+
+    One with a link to somebody who is cut off may not close within Zenoh's ten seconds. That is told, and no reason to
+    lose what its process has to report: the link ends with the process.
+    """
+    try:
+        yield
+    finally:
+        try:
+            session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError as error:
+            log.warning("not all links were closed: %s", _reason(error))
 
 
 def never_linger() -> None:
