@@ -261,7 +261,7 @@ class Node:
         """
         own = self.ledger.of(self.id)
         assert own is not None  # the ledger begins with it
-        end = own.last - self._window
+        end = max(own.last - self._window, self.born - 1)
         return self.born, end, own.runs(end)
 
     def event(self, kind: str, now: int, **details: object) -> Message:
