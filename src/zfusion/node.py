@@ -368,6 +368,10 @@ class Node:
             return
         if message.born != self._lives.get(message.node):
             return  # its sender's new life was heard before this could be used
+        refusal = self._wary.refuses(stage, message.fields) if self._wary else None
+        if refusal is not None:
+            counters.refused[refusal] += 1
+            return
         if step < self._closing(stage) - self._window:
             counters.too_late[message.stage] += 1
         else:
