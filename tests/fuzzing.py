@@ -25,7 +25,7 @@ from zfusion.messages import Decoder, decode_any, decode_reading, encode, encode
 from zfusion.model.types import NodeId
 from zfusion.node import LOOKAHEAD, REMEMBERED, Node
 from zfusion.stages import BUILT_IN, INTERMEDIATE, MEASUREMENT, TRUTH, TRUTH_SENDER, Message, Stage
-from zfusion.status import HistoryAnswer, Phase, Status
+from zfusion.status import Counts, HistoryAnswer, Phase, RecorderStatus, Status
 
 T = TypeVar("T")
 
@@ -81,7 +81,9 @@ def legal() -> list[dict[str, Any]]:
     """A legal map of every kind that goes over the wire."""
     head = {"v": 1, "node": 2, "step": 9, "t_ns": 10**18, "seq": 7, "born": 3}
     matrix = {"P": [4.0, 1.0, 1.0, 3.0], "shape": [2, 2]}
-    status = Status(2, "f" * 64, Phase.RUNNING, 9, 3, 10**18, {1: 5, 2: 6}, machine="m")
+    edges = {"3": {"lost": {"measurement": 1}}}
+    counts = Counts("h", 0, 1.5, 0.5, {"measurement": 3}, edges, {}, {}, {"measurement": {"7": 2}}, {}, {"held": 1})
+    status = Status(2, "f" * 64, Phase.RUNNING, 9, 3, 10**18, {1: 5, 2: 6}, machine="m", counts=counts)
     return [
         head | {"y": [1.5]},
         head | {"x": [0.5, 2.0], "used": [2, 3], "history": [[3, [2, 3, 4]], [6, []]]},
@@ -91,6 +93,7 @@ def legal() -> list[dict[str, Any]]:
         head | {"node": TRUTH_SENDER, "x": [0.5, 2.0]},
         decode_any(status.encode()),
         {"born": 3, "end": 9, "runs": [[3, [2, 3]], [5, []], [7, [2, 3, 4]]]},
+        decode_any(RecorderStatus(5, 0, 0, 1, "x.mcap", "h").encode()),
         {"from": 2, "started": 10**18, "leaving": False},
     ]
 
@@ -104,6 +107,7 @@ READERS: list[Callable[[bytes], object]] = [
     decode_any,
     read_stamp,
     Status.decode,
+    RecorderStatus.decode,
     lambda data: HistoryAnswer.decode(data, frozenset(NEIGHBOURS[2])),
     lambda data: decode_reading(data, True, 1),
     lambda data: decode_reading(data, False, 1),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from zfusion.cli import logs
 from zfusion.cli.common import (
     Connect,
     ControlFd,
@@ -40,6 +43,12 @@ from zfusion.cli.common import (
 from zfusion.cli.progress import design_first
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.model.types import NodeId
+
+if TYPE_CHECKING:
+    from zfusion.swarm.launch import Child, Launcher
+
+    WatchedBy = Callable[[Launcher, Mapping[NodeId, Child], Child | None], None]
 
 NetnsKind = Literal["tun", "netem"]
 
@@ -87,17 +96,32 @@ def launched(
     restart: bool = False,
     netns: str | None = None,
     quiet: bool = False,
+    directory: Path | None = None,
+    watch: WatchedBy | None = None,
+    health_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Launch a swarm, show how it goes unless `quiet`, and summarise it."""
+    """Launch a swarm, show how it goes unless `quiet`, and summarise it.
+
+    The logs go to `directory`, by default where the recording does. `watch` is called about ten times a second with the
+    launcher and its processes, of which the nodes tell their health every `health_s`.
+    """
     from zfusion.report.summary import summarize
     from zfusion.report.table import LiveTable
     from zfusion.swarm.launch import Launcher, LaunchOptions
 
-    directory = recording.parent if recording is not None else default_directory(scenario)
-    logs = directory / f"{run}.logs"
+    if directory is None:
+        directory = recording.parent if recording is not None else default_directory(scenario)
+    logs.about(run)
     design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
-        options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
+        say = logs.log.warning if logs.as_json() else table.message
+
+        def update(nodes: Mapping[NodeId, Child], recorder: Child | None) -> None:
+            table.update(nodes, recorder)
+            if watch is not None:
+                watch(launcher, nodes, recorder)
+
+        options = LaunchOptions(run, directory / f"{run}.logs", recording, restart, netns, health_s, update, say)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -166,6 +190,7 @@ def node(
     emulation: Annotated[
         bool, typer.Option("--emulation/--no-emulation", help="Do to messages what the scenario's links say.")
     ] = True,
+    health: Annotated[float, typer.Option(hidden=True)] = 0.0,
     as_json: Json = False,
     control_fd: ControlFd = None,
 ) -> None:
@@ -185,6 +210,7 @@ def node(
             epoch_ns=None if epoch is None else epoch_ns(epoch),
             steps=None if forever else loaded.steps,
             emulate=emulation,
+            health_s=0.0 if control is None else health,
         )
         tell = None if control is None else lambda status: control.tell(status=plain(asdict(status)))
 
@@ -192,11 +218,18 @@ def node(
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
             control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
 
-        live = LiveNode(loaded, own, options, tell, None if control is None else announce)
+        def tell_health(told: Any) -> None:
+            """Tell the launcher, for whoever watches."""
+            control.tell(health=told)
+
+        logs.about(options.run, own)
+        live = LiveNode(loaded, own, options, tell, None if control is None else announce, tell_health)
+        logs.about(options.run, own, lambda: None if live.node is None else live.node.step)
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
-        report = asdict(live.run())
+        with noted(control, loaded, options.run, options.endpoints.listen, own):
+            report = asdict(live.run())
     if control is not None:
         control.tell(report=report)
         return
@@ -214,6 +247,7 @@ def record(
     control_fd: ControlFd = None,
 ) -> None:
     """Record a run: the recorder alone, for swarms on many machines. Ends with Ctrl-C, or when all nodes have left."""
+    from zfusion.drivers.designs import content_of
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
@@ -223,6 +257,7 @@ def record(
     with ToldTo(control):
         loaded = load_scenario(scenario)
         name = given_run(run, loaded)
+        logs.about(name)
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
@@ -232,20 +267,45 @@ def record(
             method=method,
             seed=loaded.seed,
             stages=chosen(loaded).stages,
+            design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))
-        recorder = Recorder(
-            loaded, name, recorder_endpoints(loaded, connect, listen), writer, until_all_gone=control is None, tell=tell
-        )
+        endpoints = recorder_endpoints(loaded, connect, listen)
+        recorder = Recorder(loaded, name, endpoints, writer, until_all_gone=control is None, tell=tell)
         on_signals(recorder.stop)
         if control is not None:
             control.on_stop(recorder.stop)
-        report = asdict(recorder.run())
+        with noted(control, loaded, name, endpoints.listen):
+            report = asdict(recorder.run())
     if control is not None:
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+
+
+def noted(
+    control: Any, scenario: Scenario, run: str, listens: Sequence[str], node: NodeId | None = None
+) -> AbstractContextManager[None]:
+    """Have observers on this machine find a process that was started by hand: a node, or the recorder."""
+    from zfusion.drivers.endpoints import listens_at
+    from zfusion.drivers.registry import Entry, registered
+
+    if control is not None:  # the launcher does it for all
+        return nullcontext()
+    transport = scenario.transport
+    own = transport.zenoh_config if not listens else None
+    own_endpoint = {str(node): listens[0]} if node is not None and listens else {}
+    entry = Entry(
+        run=run,
+        scenario=scenario.name,
+        endpoints=own_endpoint,
+        elsewhere={} if own else {str(i): endpoint for i, endpoint in listens_at(scenario).items()},
+        recorder=listens[0] if node is None and listens else None,
+        low_latency=transport.preset == "lowlatency",
+        config=str(scenario.absolute(own)) if own else None,
+    )
+    return registered(entry)
 
 
 def network(

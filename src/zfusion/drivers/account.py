@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import cast
 
@@ -19,6 +21,7 @@ from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node, Patience
 from zfusion.stages import ARRIVALS, ESTIMATE, INTERMEDIATE, REVISED, TRUTH, TRUTH_SENDER, Message
+from zfusion.status import Counts
 
 COMPARED = (INTERMEDIATE.name, ESTIMATE.name, REVISED.name)
 """Stages whose x is an estimate of the state at their step."""
@@ -125,28 +128,55 @@ class Account:
             node.sent[ARRIVALS.name] = seq + 1
             yield Message(node.id, max(node.step, node.born), ARRIVALS.name, seq, node.born, now_ns, {"data": data})
 
-    def report(self) -> NodeReport:
-        """What became of it all so far."""
-        node, latencies = self._node, Latencies()
+    def latencies(self) -> Latencies:
+        """From measurement to estimate, of all steps so far."""
+        latencies = Latencies()
         for pace in self._paces:
             latencies.merge(pace.latencies.sparse())
+        return latencies
+
+    def report(self) -> NodeReport:
+        """What became of it all so far."""
+        node = self._node
         return NodeReport(
             node=node.id,
             born=node.born,
             step=node.step,
             completed=node.completed,
             skipped=self.skipped,
-            elapsed_s=(max(pace.ended_ns for pace in self._paces) - self._begun_ns) / 1e9,
+            elapsed_s=self.elapsed_s,
             sent=dict(node.sent),
             edges=edge_report(node),
             fallbacks=node.fallbacks,
             errors={stage: errors.summary() for stage, errors in self._errors.items()},
-            latency=latencies.told(),
+            latency=self.latencies().told(),
             overheard=dict(self._source.counters),
             estimate=told_estimate(node),
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},
             measured=self.meter.told(),
             incidents=dict(node.incidents),
+        )
+
+    @property
+    def elapsed_s(self) -> float:
+        """From the start of its first step to the end of its last."""
+        return (max(pace.ended_ns for pace in self._paces) - self._begun_ns) / 1e9
+
+    def counts(self) -> Counts:
+        """What was counted so far, for those who look on; cheap."""
+        node = self._node
+        return Counts(
+            host=platform.node(),
+            skipped=self.skipped,
+            elapsed_s=self.elapsed_s,
+            cpu_s=time.process_time(),
+            sent=dict(node.sent),
+            edges=edge_report(node),
+            overheard=dict(self._source.counters),
+            incidents=dict(node.incidents),
+            waits=self.meter.waits(),
+            clocks={},
+            queues={},
         )
 
     def last_words(self) -> dict[str, object]:

@@ -10,17 +10,21 @@ Everything happens on one thread. Zenoh's callbacks only leave notices, which ar
 from __future__ import annotations
 
 import gc
+import logging
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.complaints import Complaints
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.health import health
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.key_source import KeySource
@@ -30,19 +34,24 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, closing, open_session, publisher
+from zfusion.drivers.transport import RECEIPT, closing, never_linger, open_session, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
-from zfusion.model.types import NodeId
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
-from zfusion.status import Phase, Status
+from zfusion.status import Counts, Phase, Status
+
+log = logging.getLogger(__name__)
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
+
+LINGERLESS_NS = 1_000_000_000
+"""How often a node sees to the links that it was not told of; shorter than their lease."""
 
 AHEAD = 65_536
 """Messages kept here that are too far ahead for the node to take: what a swarm says in half a minute, while a node that
@@ -69,6 +78,8 @@ class LiveOptions:
     """Last step; None: until told to stop."""
     emulate: bool = True
     """Whether the node is to do to its neighbours' messages what the scenario's links say; False: the network does."""
+    health_s: float = 0.0
+    """How often to tell of its health; 0: never."""
 
 
 class LiveNode:
@@ -81,8 +92,10 @@ class LiveNode:
         options: LiveOptions,
         tell: Callable[[Status], None] | None = None,
         announce: Callable[[Blow], None] | None = None,
+        tell_health: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
-        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before.
+        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before;
+        `tell_health` with `health.health`, as often as `options` say.
 
         Raises InputError where Zenoh does not open, or the sensor's source or a link's, and for a plan that stops the
         node where nobody is there to set it going again.
@@ -102,11 +115,14 @@ class LiveNode:
         self._stamped = False
         """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
-        self._told_ns = 0
+        self._told_ns = self._lingerless_ns = 0
+        self._tell_health, self._health_ns = tell_health, round(options.health_s * 1e9)
+        self._told_health_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
         """Whether a paced step begins late, if it has to, rather than not at all."""
+        self._complaints = Complaints()
         self._misfortune = Misfortune(scenario, node, announce)
         link = links_of(scenario) if options.emulate else ideal
         config = scenario.transport.zenoh_config
@@ -159,8 +175,8 @@ class LiveNode:
         self.stopping = True
         self._inbox.notify(None)
 
-    def status(self) -> Status:
-        """How the node is doing."""
+    def status(self, *, counted: bool = False) -> Status:
+        """How the node is doing; what it has `counted` where that is wanted."""
         node, meeting = self.node, self._meeting
         return Status(
             node=self.id,
@@ -174,7 +190,19 @@ class LiveNode:
             fallbacks=node.fallbacks if node else 0,
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
+            counts=self._counts() if counted else None,
         )
+
+    def health(self, node: Node, account: Account) -> dict[str, Any]:
+        """See `health.health`."""
+        inbox = self._inbox
+        queues = {
+            "ahead": len(self._ahead),
+            "held": self._hearing.holds,
+            "posted": len(inbox.posted),
+            "notices": len(inbox.notices),
+        }
+        return health(node, account, queues=queues, overrun=inbox.overrun, now_ns=self._now())
 
     def report(self) -> NodeReport:
         """How it has gone so far."""
@@ -185,14 +213,31 @@ class LiveNode:
         for *_, heard in self._ahead:
             refused = report.edges[str(heard.message.node)]["refused"]
             refused["too_early"] = refused.get("too_early", 0) + 1
-        report.overheard = dict(Counter(report.overheard) + self._presence.overheard)
-        if self._inbox.overrun:
-            report.overheard["overrun"] = self._inbox.overrun
-        report.clocks = {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
-        report.queues = {"ahead": self._most_ahead, "held": self._hearing.most_held}
+        report.overheard = self._overheard(report.overheard)
+        report.clocks = self._clocks()
+        report.queues = self._queues()
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
         return report
+
+    def _counts(self) -> Counts | None:
+        """What was counted so far; None before the first step."""
+        if self._account is None:
+            return None
+        counts = self._account.counts()
+        return replace(
+            counts, overheard=self._overheard(counts.overheard), clocks=self._clocks(), queues=self._queues()
+        )
+
+    def _overheard(self, by_source: Mapping[str, int]) -> dict[str, int]:
+        here = Counter(overrun=self._inbox.overrun, unheeded=self._presence.unheeded)
+        return dict(Counter(by_source) + self._presence.overheard + here)
+
+    def _clocks(self) -> dict[str, dict[str, float]]:
+        return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+
+    def _queues(self) -> dict[str, int]:
+        return {"ahead": self._most_ahead, "held": self._hearing.most_held}
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
         """The source of the readings that a program of the user's publishes."""
@@ -231,6 +276,7 @@ class LiveNode:
         self.node, self.phase = node, Phase.RUNNING
         self._account = Account(node, self._source, first, stages=exchanged, marked_every=every)
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
+        log.info("begins with step %d, expecting %s", start.born, ", ".join(map(str, sorted_ids(start.expected))))
         self.tell_status()
         return node
 
@@ -307,6 +353,9 @@ class LiveNode:
             self._tell_arrivals()
             if now - self._told_ns > REPORT_NS:
                 self.tell_status()
+            if self._health_ns and now - self._told_health_ns >= self._health_ns:
+                self._told_health_ns = now
+                self._tell_health(self.health(node, account))
         for estimate in self._estimates:
             account.compare(estimate)
         self._estimates.clear()
@@ -410,6 +459,7 @@ class LiveNode:
         node = self.node
         if node is None:
             return
+        log.warning("node %s is gone", j)
         self._hearing.drain(j)
         heard = [self._last_heard[channel] for channel in self._hearing.channels(j) if channel in self._last_heard]
         last = [decode_any(data) for data in (*heard, *self._hearing.held(j)[:MOST_HELD])]
@@ -421,9 +471,20 @@ class LiveNode:
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
         self._told_ns = self._now()
+        if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
+            self._lingerless_ns = self._told_ns
+            self._complain()
+            never_linger()  # observers have links, too, and show no token
         self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())
+
+    def _complain(self, *, ended: bool = False) -> None:
+        """Log what was refused."""
+        if self.node is not None and self._account is not None:
+            refused: dict[str, Mapping[str, int]] = {f"node {j}": c.refused for j, c in self.node.counters.items()}
+            refused["elsewhere"] = self._overheard(self._source.counters)
+            self._complaints.look(self._now(), refused, ended=ended)
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""
@@ -434,3 +495,5 @@ class LiveNode:
         self.tell_status()
         self._presence.take_leave()
         self._hearing.end()
+        self._complain(ended=True)
+        log.info("ends: %d steps completed, %d skipped", node.completed, self._account.skipped)

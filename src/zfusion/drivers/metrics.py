@@ -239,6 +239,8 @@ class RecorderReport:
     """By topic, where anything is missing that its sender sent."""
     foreign: int = 0
     """What came and is not on the file: on keys that are none of the scenario's, or larger than any message is."""
+    unheeded: int = 0
+    """Questions, and news of nodes, that were dropped because too many waited."""
 
     @classmethod
     def of(cls, recording: Recording) -> RecorderReport:

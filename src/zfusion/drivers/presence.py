@@ -50,6 +50,9 @@ and Zenoh's thread may be waiting for that while it holds what dropping needs.""
 MAX_NOTICES = 4096
 """Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""
 
+MOST_NOTICES = 65_536
+"""Notices waiting, above which nothing more is noted, and that is counted: only somebody who floods makes so many."""
+
 RECORDER = "the recorder"
 """Stands for it among node ids."""
 
@@ -62,8 +65,8 @@ class Host(Protocol):
     phase: Phase
     stopping: bool
 
-    def status(self) -> Status:
-        """How it is doing."""
+    def status(self, *, counted: bool = False) -> Status:
+        """How it is doing; what it has `counted` where that is wanted."""
 
     def tell_status(self) -> None:
         """Tell the launcher how it is doing."""
@@ -90,6 +93,8 @@ class Presence:
         self._now = clock.now
         self.overheard: Counter[str] = Counter()
         """What came and was neither a question nor an answer, by reason."""
+        self.unheeded = 0
+        """What happened and was not noted, too much being to be attended to."""
         self.strangers: set[NodeId] = set()
         """Neighbours that run something else than this node."""
         self._host, self._scenario, self._graph, self._run = host, scenario, graph, run
@@ -208,8 +213,11 @@ class Presence:
         return on_zenoh_thread(partial(self._note, kind))
 
     def _note(self, kind: str, about: Any) -> None:
-        if kind in QUESTIONS and len(self._inbox.notices) >= MAX_NOTICES:
-            about.drop()
+        waiting = len(self._inbox.notices)
+        if waiting >= (MAX_NOTICES if kind in QUESTIONS else MOST_NOTICES):
+            self.unheeded += 1
+            if kind in QUESTIONS:
+                about.drop()
         else:
             self._inbox.notify((kind, about, self._now()))
 
@@ -263,12 +271,14 @@ class Presence:
                 self._host.part_with(j)
             return
         never_linger()  # there may be a new link
+        log.info("node %s is there", j)
         self.meeting.came(j)
         if self._host.node is not None:
             self._ask_status(j)
 
     def _on_recorder(self, sample: Any, _at_ns: int) -> None:
         self.meeting.recorder = sample.kind == zenoh.SampleKind.PUT
+        log.info("the recorder is %s", "there" if self.meeting.recorder else "gone")
         if not self.meeting.recorder:
             self._unconfirmed.discard(RECORDER)
 
@@ -319,9 +329,10 @@ class Presence:
         with query:
             question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
             asker, started = question.get("from"), question.get("started")
-            known = type(asker) in (int, str) and asker in self.meeting.linked  # anybody may ask, and say anything
+            known = type(asker) in (int, str) and asker in self.meeting.linked  # whoever else asks is not remembered
             holder = self._holder(asker, started) if known and type(started) is int else None
-            status = replace(self._host.status(), heard_ns=at_ns, told_ns=self._now(), holder_ns=holder)
+            status = self._host.status(counted=question.get("counts") is True)
+            status = replace(status, heard_ns=at_ns, told_ns=self._now(), holder_ns=holder)
             query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
             if asker is not None and known and holder is None:
                 self._answered.add(asker)

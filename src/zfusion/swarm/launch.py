@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
@@ -22,6 +22,7 @@ from typing import Any
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
+from zfusion.drivers.registry import Entry, registered
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -44,12 +45,15 @@ MAX_RESTARTS = 10
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
 
+TAIL_BYTES = 65_536
+"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
+
 PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
 between our finding it free and the node's listening on it."""
 
-_tried = count(os.getpid() * 61)
-"""Two launchers begin at different places."""
+BLOCK = 200
+"""Ports that one process at a time takes from."""
 
 DESIGN = "design.npz"
 """Among the logs: what all nodes share, where the method is designed off-line and the scenario names no file."""
@@ -74,6 +78,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    health: Mapping[str, Any] = field(default_factory=dict)
+    """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
     told: bool = False
     """Whether it has reported on its present life."""
@@ -118,6 +124,8 @@ class LaunchOptions:
     restart: bool = False
     netns: str | None = None
     """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
+    health_s: float = 0.0
+    """How often every node tells of its health; 0: never."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -158,7 +166,8 @@ class Launcher:
                 for child in self._everybody():
                     if child is not self._network:
                         self._start(child)
-            self._watch_nodes()
+            with registered(self._entry()):
+                self._watch_nodes()
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
@@ -185,6 +194,7 @@ class Launcher:
         scenario, options = self._scenario, self._options
         transport, common = scenario.transport, ["--run", options.run]
         listens, recorder_dials = self._endpoints()
+        self._dials, self._recorder_listens = recorder_dials, ""
         nodes: dict[NodeId, Child] = {}
         for place, i in enumerate(scenario.ids):
             command = [*ZFUSION, "node", str(self._file), "--id", str(i), *common]
@@ -195,12 +205,16 @@ class Launcher:
                 command.append("--await-recorder")
             if self._network is not None:
                 command.append("--no-emulation")
+            if options.health_s:
+                command += ["--health", str(options.health_s)]
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
             command = [*ZFUSION, "record", str(self._file), *common, "-o", str(options.recording)]
             if self._network is not None or not transport.zenoh_config:
                 command += _each("--connect", [recorder_dials[i] for i in scenario.ids])
+                [self._recorder_listens] = free_endpoints(1)  # for observers: peers pass nothing on
+                command += ["--listen", self._recorder_listens]
             recorder = Child("the recorder", None, command, options.logs / "recorder.log", len(scenario.ids))
         return recorder, nodes
 
@@ -212,6 +226,21 @@ class Launcher:
             return {p.node: p.endpoint for p in where}, {p.node: p.recorder_dials for p in where}
         listens = dict(zip(ids, free_endpoints(len(ids)), strict=True)) | self._scenario.transport.endpoints
         return listens, listens
+
+    def _entry(self) -> Entry:
+        """What observers on this machine need in order to look at the run."""
+        transport, network = self._scenario.transport, self._network
+        own = None if network is not None else transport.zenoh_config
+        enter = network.status.get("enter", ()) if network is not None else ()
+        return Entry(
+            run=self._options.run,
+            scenario=self._scenario.name,
+            endpoints={str(i): endpoint for i, endpoint in self._dials.items()},
+            recorder=self._recorder_listens if self._recorder is not None else None,
+            low_latency=transport.preset == "lowlatency",
+            config=str(self._scenario.absolute(own)) if own else None,
+            enter=tuple(enter[len(self._scenario.ids)]) if enter else (),
+        )
 
     def _plan_network(self) -> Child | None:
         options = self._options
@@ -256,7 +285,7 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.told = None, None, {}, False
+        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _entrance(self, child: Child) -> Sequence[str]:
@@ -320,6 +349,8 @@ class Launcher:
             if "status" in message:
                 child.status = message["status"]
                 self._note_beginning(child.status)
+            elif "health" in message:
+                child.health = message["health"]
             elif "blow" in message:
                 self._note_blow(child, message["blow"])
                 child.reports += [message["report"]] if message["report"] else []
@@ -416,7 +447,9 @@ class Launcher:
         )
 
     def _tail(self, child: Child) -> str:
-        lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
+        with child.log.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
         return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
@@ -473,7 +506,7 @@ def free_endpoints(number: int) -> list[str]:
                 break
             sockets.append(socket.socket())
             try:
-                sockets[-1].bind(("127.0.0.1", PORTS[next(_tried) % len(PORTS)]))
+                sockets[-1].bind(("127.0.0.1", next(_ports)))
             except OSError:
                 sockets.pop().close()
         if len(sockets) < number:
@@ -482,6 +515,26 @@ def free_endpoints(number: int) -> list[str]:
     finally:
         for s in sockets:
             s.close()
+
+
+def _own_ports() -> Iterator[int]:
+    """Ports, without end, of blocks that no other process takes ports from meanwhile.
+
+    What is free for one launcher is free for another, too, until the node listens: both would give it away. So a
+    block is his who holds its first port; one that somebody else holds is passed over, after a port that is not free.
+    """
+    blocks = [PORTS[first : first + BLOCK] for first in range(0, len(PORTS), BLOCK)]
+    for n in count(os.getpid()):
+        mark, *ports = blocks[n % len(blocks)]
+        with socket.socket() as holder:
+            try:
+                holder.bind(("127.0.0.1", mark))
+            except OSError:
+                ports = [mark]
+            yield from ports
+
+
+_ports = _own_ports()
 
 
 def _let_finish(pid: int) -> None:

@@ -1,0 +1,75 @@
+"""Quantities of many processes over a long run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from zfusion.model.types import Array
+from zfusion.report.figures import style
+
+MOST_POINTS = 600
+"""Samples that a line shows; of more, means over as many equal blocks."""
+
+PANEL_HEIGHT_IN = 2.0
+
+UNITS = (("h", 3600.0, 7200.0), ("min", 60.0, 180.0), ("s", 1.0, 0.0))
+"""Of the time axis, in seconds, and the least length of a run from which on each is used."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A quantity of one process, (n,), or the median of many with the range from the least to the most of them."""
+
+    label: str
+    t_s: Array
+    values: Array
+    low: Array | None = None
+    high: Array | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines that share an axis."""
+
+    y: str
+    lines: Sequence[Line]
+
+
+def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
+    """One panel below the other over a common time; what is not judged is shaded."""
+    with style.drawing():
+        panels = [panel for panel in panels if any(np.isfinite(line.values).any() for line in panel.lines)]
+        if not panels:
+            return style.nothing("there are no samples to show")
+        figure = Figure(figsize=(style.WIDTH_IN, 0.7 + PANEL_HEIGHT_IN * len(panels)), layout="constrained")
+        axes: list[Axes] = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False).ravel())
+        longest = max(float(line.t_s[-1]) for panel in panels for line in panel.lines)
+        unit, scale = next((name, size) for name, size, least in UNITS if longest >= least)
+        for ax, panel in zip(axes, panels, strict=True):
+            for number, line in enumerate(panel.lines):
+                _draw(ax, line, style.COLOURS[number % len(style.COLOURS)], scale)
+            ax.axvspan(0, warm_up_s / scale, color=style.GREY, alpha=0.10, linewidth=0)
+            ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
+            ax.set_xlim(0, longest / scale)
+            ax.set_ylabel(panel.y)
+            ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        axes[-1].set_xlabel(f"time [{unit}]")
+        return figure
+
+
+def _draw(ax: Axes, line: Line, colour: str, scale: float) -> None:
+    t, values = _blocks(line.t_s) / scale, _blocks(line.values)
+    if line.low is not None and line.high is not None:
+        ax.fill_between(t, _blocks(line.low), _blocks(line.high), color=colour, alpha=0.2, linewidth=0, gid="range")
+    ax.plot(t, values, color=colour, linewidth=1.2, label=line.label, gid="measured")
+
+
+def _blocks(values: Array) -> Array:
+    if len(values) <= MOST_POINTS:
+        return values
+    return np.array([np.nanmean(b) if np.isfinite(b).any() else np.nan for b in np.array_split(values, MOST_POINTS)])
