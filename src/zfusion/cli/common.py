@@ -177,10 +177,9 @@ def control_of(descriptor: int | None, *, deadly: bool) -> Any:
     """The line to the launcher, in a process that one started."""
     if descriptor is None:
         return None
-    from zfusion.swarm.control import ChildEnd, die_with_parent
+    from zfusion.swarm.control import ChildEnd, on_death_of_parent
 
-    if deadly:
-        die_with_parent()
+    on_death_of_parent(signal.SIGKILL if deadly else signal.SIGCONT)
     return ChildEnd(descriptor)
 
 

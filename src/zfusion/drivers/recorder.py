@@ -26,7 +26,7 @@ from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
-from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
+from zfusion.drivers.transport import closing, never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError, RecordingError, RunError
 from zfusion.gaps import Gaps
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
@@ -114,7 +114,7 @@ class Recorder:
     def run(self) -> RecorderReport:
         """Record; the file is finished when this returns, whatever ends it. What could not be written is told."""
         try:
-            with self._session:
+            with closing(self._session):
                 try:
                     self._declare()
                     self._record()

@@ -14,8 +14,8 @@ import socket
 import stat
 import struct
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -76,6 +76,22 @@ def open_session(
 def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
     """What can say why those that a session dials do not come; given what the session is opened with."""
     return _prober(_config(endpoints, config_file=config_file))
+
+
+@contextmanager
+def closing(session: zenoh.Session) -> Iterator[None]:
+    """Close a session in the end.
+
+    One with a link to somebody who is cut off may not close within Zenoh's ten seconds. That is told, and no reason to
+    lose what its process has to report: the link ends with the process.
+    """
+    try:
+        yield
+    finally:
+        try:
+            session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError as error:
+            log.warning("not all links were closed: %s", _reason(error))
 
 
 def never_linger() -> None:
