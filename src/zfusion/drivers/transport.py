@@ -29,9 +29,9 @@ from zfusion.drivers.endpoints import Endpoints
 from zfusion.errors import InputError
 
 HEAPS = 2
-"""Of the C library, in the place of eight a processor. Zenoh works with some dozens of threads that come and go, and each
-of them fills whatever heap it finds free: a recorder of 32 nodes was at 117 MiB after a quarter of an hour and growing,
-69 MiB of them in 15 heaps."""
+"""Of the C library, in the place of eight a processor. Zenoh works with some dozens of threads that come and go, and
+each of them fills whatever heap it finds free: a recorder of 32 nodes was at 117 MiB after a quarter of an hour and
+growing, 69 MiB of them in 15 heaps."""
 
 _M_ARENA_MAX = -8
 
