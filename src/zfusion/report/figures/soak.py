@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from zfusion.model.types import Array
 from zfusion.report.figures import style
+from zfusion.report.figures.quantities import spans_decades
 
 MOST_POINTS = 600
 """Samples that a line shows; of more, means over as many equal blocks."""
@@ -38,6 +39,8 @@ class Panel:
 
     y: str
     lines: Sequence[Line]
+    logarithmic: bool = False
+    """Where its values span decades."""
 
 
 def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
@@ -54,12 +57,21 @@ def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
             for number, line in enumerate(panel.lines):
                 _draw(ax, line, style.COLOURS[number % len(style.COLOURS)], scale)
             ax.axvspan(0, warm_up_s / scale, color=style.GREY, alpha=0.10, linewidth=0)
-            ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
+            if panel.logarithmic and spans_decades(_positive(panel)):
+                ax.set_yscale("log")
+                style.tick_logarithmically(ax.yaxis)
+            else:
+                ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
             ax.set_xlim(0, longest / scale)
             ax.set_ylabel(panel.y)
             ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         axes[-1].set_xlabel(f"time [{unit}]")
         return figure
+
+
+def _positive(panel: Panel) -> list[float]:
+    values = np.concatenate([line.values for line in panel.lines])
+    return [value for value in values.tolist() if value > 0]
 
 
 def _draw(ax: Axes, line: Line, colour: str, scale: float) -> None:
