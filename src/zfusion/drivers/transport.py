@@ -23,8 +23,8 @@ os.environ.setdefault(
     "(rx: (handover: app), acc: (handover: app), tx: (handover: app), net: (handover: app), "
     "app: (worker_threads: 1, max_blocking_threads: 50))",
 )
-# One thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on. Beside it
-# there are those that wait for something, of which it makes more and more where links come and go under load.
+# One thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on. Beside
+# it there are those that wait for something, of which it makes more and more where links come and go under load.
 
 import zenoh
 
