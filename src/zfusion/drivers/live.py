@@ -142,11 +142,7 @@ class LiveNode:
         self._now = self._clock.now
         self._inbox = Inbox(self._session, self._clock)
         self._links = link if isinstance(link, LinkNetwork) else None
-        self._hearing = Hearing(self._inbox, self)
-        if self._links is not None:
-            self._hearing = EmulatedHearing(
-                self._inbox, self, node, self._links, self._misfortune.timeline, self._clock
-            )
+        self._hearing = self._hears()
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
         self._presence = Presence(
@@ -252,6 +248,12 @@ class LiveNode:
 
     def _queues(self) -> dict[str, int]:
         return {"ahead": self._most_ahead, "held": self._hearing.most_held}
+
+    def _hears(self) -> Hearing:
+        """Directly, or through the links that the scenario describes."""
+        if self._links is None:
+            return Hearing(self._inbox, self)
+        return EmulatedHearing(self._inbox, self, self.id, self._links, self._misfortune.timeline, self._clock)
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
         """The source of the readings that a program of the user's publishes."""

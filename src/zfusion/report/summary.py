@@ -102,15 +102,7 @@ def summarize(
         "steps": scenario.steps,
         "completed_steps": {str(i): sum(r.completed for r in reports.get(i, ())) for i in scenario.ids},
         "messages": {"sent": dict(sent), "recorded": dict(recorder.recorded) if recorder else {}},
-        "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
-        "late": sum(edge.late for edge in edges),
-        **{kind: _of_all_edges(lives, kind) for kind in LATE_FATES},
-        "missed": sum(edge.missed for edge in edges),
-        "refused": _refused(lives),
-        "fallbacks": sum(report.fallbacks for report in lives),
-        "incidents": _incidents(lives),
-        "skipped": sum(report.skipped for report in lives),
-        **{name: sum(getattr(report, name) for report in lives) for name in CLOCK_COUNTERS},
+        **_counted(lives, edges, recorder),
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
         "latency_us": _quantiles(report.latency for report in lives),
@@ -136,6 +128,21 @@ def summarize(
         "failures": list(failures),
         "logs": logs,
         "network": network,
+    }
+
+
+def _counted(lives: Sequence[NodeReport], edges: Sequence[Edge], recorder: RecorderReport | None) -> dict[str, Any]:
+    """What was lost, late, refused or left out, in all."""
+    return {
+        "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
+        "late": sum(edge.late for edge in edges),
+        **{kind: _of_all_edges(lives, kind) for kind in LATE_FATES},
+        "missed": sum(edge.missed for edge in edges),
+        "refused": _refused(lives),
+        "fallbacks": sum(report.fallbacks for report in lives),
+        "incidents": _incidents(lives),
+        "skipped": sum(report.skipped for report in lives),
+        **{name: sum(getattr(report, name) for report in lives) for name in CLOCK_COUNTERS},
     }
 
 
