@@ -39,8 +39,9 @@ from swarms import (
 from zfusion.drivers import registry
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.observer import Observer, find_swarm
+from zfusion.drivers.settings import LEASE_MS
 from zfusion.drivers.simulated import simulate
-from zfusion.drivers.transport import LEASE_MS, open_session, publisher
+from zfusion.drivers.transport import open_session, publisher
 from zfusion.errors import InputError
 from zfusion.model.scenario import load_scenario
 from zfusion.report.swarm_table import seen_swarm
