@@ -262,7 +262,7 @@ class Node:
         """
         own = self.ledger.of(self.id)
         assert own is not None  # the ledger begins with it
-        end = own.last - self._window
+        end = max(own.last - self._window, self.born - 1)
         return self.born, end, own.runs(end)
 
     def event(self, kind: str, now: int, **details: object) -> Message:
@@ -370,6 +370,10 @@ class Node:
             return
         if message.born != self._lives.get(message.node):
             return  # its sender's new life was heard before this could be used
+        refusal = self._wary.refuses(stage, message.fields) if self._wary else None
+        if refusal is not None:
+            counters.refused[refusal] += 1
+            return
         if step < self._closing(stage) - self._window:
             counters.too_late[message.stage] += 1
         else:

@@ -24,6 +24,7 @@ from zfusion.cli import (
     models,
     observe,
     recordings,
+    repair,
     report,
     soak,
 )
@@ -58,6 +59,9 @@ for command in (
     recordings.replay,
     recordings.info,
     recordings.export,
+    repair.recover,
+    repair.merge,
+    repair.cut,
     report.report,
     soak.soak,
 ):

@@ -254,7 +254,7 @@ def record(
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
-    from zfusion.recording.writer import RecordingWriter
+    from zfusion.recording import Keeping, RecordingWriter
 
     control = control_of(control_fd, deadly=False)
     with ToldTo(control):
@@ -273,6 +273,7 @@ def record(
             stages=chosen(loaded).stages,
             design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
+            keeping=Keeping.of(loaded.recording),
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))
         endpoints = recorder_endpoints(loaded, connect, listen)
@@ -286,6 +287,9 @@ def record(
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+    if report["stopped"]:
+        err.print(f"{report['stopped']}: {report['unrecorded']} messages are not on the recording", soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def noted(

@@ -35,7 +35,7 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, never_linger, open_session, prober, publisher
+from zfusion.drivers.transport import RECEIPT, closing, never_linger, open_session, prober, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
@@ -158,7 +158,7 @@ class LiveNode:
 
         Raises InputError where a neighbour runs another scenario or version, RunError where the source fails.
         """
-        with self._session:
+        with closing(self._session):
             try:
                 self._declare()
                 start = self._presence.join()

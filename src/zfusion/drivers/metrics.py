@@ -243,13 +243,21 @@ class RecorderReport:
     """By topic, where anything is missing that its sender sent."""
     foreign: int = 0
     """What came and is not on the file: on keys that are none of the scenario's, or larger than any message is."""
+    files: list[str] = field(default_factory=list)
+    """Where the recording is: one file, or its segments."""
+    unrecorded: int = 0
+    """What came and could not be written, because the recording had stopped; also among the lost."""
+    overrun: int = 0
+    """What came and was dropped unread, being too much at once; also among the lost where its sender numbered it."""
+    stopped: str = ""
+    """Why the recording ended before the run did, if it did."""
     unheeded: int = 0
     """Questions, and news of nodes, that were dropped because too many waited."""
 
     @classmethod
     def of(cls, recording: Recording) -> RecorderReport:
         """Of a recording that is there."""
-        report = cls(str(recording.path), recording.messages)
+        report = cls(str(recording.path), recording.messages, files=list(map(str, recording.files)))
         for topic, count in recording.topics.items():
             with suppress(MessageError):
                 _, node, stage = keys.parse(topic)

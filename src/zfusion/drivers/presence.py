@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Protocol
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.claims import Claims
 from zfusion.drivers.clock_watch import ClockWatch
 from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock
 from zfusion.drivers.endpoints import linked, links_of
@@ -107,6 +108,8 @@ class Presence:
         """Who has said that it had put its last messages."""
         self._answered: set[NodeId] = set()
         """Who was told how this node is doing."""
+        self._claims = Claims(meeting.own)
+        self._token: Any = None
         self._kept: list[Any] = []
         self.clocks = ClockWatch(scenario, meeting.own, meeting.linked, clock)
         """How far the neighbours' clocks are ahead of this node's."""
@@ -123,7 +126,7 @@ class Presence:
             liveliness.declare_subscriber(keys.node_token(run, "*"), self._noting("token"), history=True),
             liveliness.declare_subscriber(keys.recorder_token(run), self._noting("recorder"), history=True),
         ]
-        self._kept.append(liveliness.declare_token(keys.node_token(run, own)))
+        self._show_token()
 
     def join(self) -> Start | None:
         """Wait until it is time to begin; None if stopped before.
@@ -146,7 +149,9 @@ class Presence:
                 next_poll += moved
                 next_word += moved
                 self.meeting.moved_ns += moved
-            start = self.meeting.start(now)
+            self._claims.check(now)
+            self._show_token()
+            start = None if self._claims.contested else self.meeting.start(now)
             if start is not None:
                 self._clock.keep()
                 self.clocks.tell_unknown(self.meeting.present)
@@ -202,6 +207,15 @@ class Presence:
         """Ask a neighbour what it used; the node is told what it answers."""
         self._query(keys.history_key(self._run, j), "history!", j)
 
+    def _show_token(self) -> None:
+        """Say that this node is there, unless there may be another of its id: whether that one goes is to be seen."""
+        if self._claims.contested:
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+        elif self._token is None:
+            self._token = self._session.liveliness().declare_token(keys.node_token(self._run, self.meeting.own))
+
     def handle_notices(self) -> None:
         """Act on all that has happened."""
         notices = self._inbox.notices
@@ -233,7 +247,13 @@ class Presence:
         self._session.get(
             key,
             on_zenoh_thread(lambda reply: self._note(kind, (about, reply, asked_ns))),
-            payload=encode_any({"from": self.meeting.own, "leaving": self._host.phase is Phase.DONE}),
+            payload=encode_any(
+                {
+                    "from": self.meeting.own,
+                    "started": self.meeting.started_ns,
+                    "leaving": self._host.phase is Phase.DONE,
+                }
+            ),
             timeout=ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
@@ -264,6 +284,7 @@ class Presence:
             return
         if sample.kind == zenoh.SampleKind.DELETE:
             self.meeting.went(j)
+            self._claims.gone(j)
             self._leaving.discard(j)
             self._unconfirmed.discard(j)
             if self._host.phase is Phase.RUNNING and j in self.meeting.hears:
@@ -296,6 +317,7 @@ class Presence:
             raise MessageError(Reason.WRONG_NODE, f"{status.node} answers for {j}")
         self._unconfirmed.discard(j)
         self.clocks.read(status, self._host.status().machine, about[2], at_ns, begun=node is not None)
+        self._claims.answered(j, status.holder_ns)
         if node is None:
             self.meeting.answered(status)
             return
@@ -319,14 +341,21 @@ class Presence:
     def _answer_status(self, query: Any, at_ns: int) -> None:
         with query:
             question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
+            asker, started = question.get("from"), question.get("started")
+            known = type(asker) in (int, str) and asker in self.meeting.linked  # whoever else asks is not remembered
+            holder = self._holder(asker, started) if known and type(started) is int else None
             status = self._host.status(counted=question.get("counts") is True)
-            status = replace(status, heard_ns=at_ns, told_ns=self._now())
+            status = replace(status, heard_ns=at_ns, told_ns=self._now(), holder_ns=holder)
             query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
-            asker = question.get("from")
-            if isinstance(asker, int | str) and asker in self.meeting.linked:  # whoever else asks is not remembered
+            if asker is not None and known and holder is None:
                 self._answered.add(asker)
                 if question.get("leaving"):
                     self._leaving.add(asker)
+
+    def _holder(self, asker: Any, started_ns: int) -> int | None:
+        """The process that is known under an asker's id, if it is another one."""
+        present, begun = asker in self.meeting.present, self._host.node is not None
+        return self._claims.asked(asker, started_ns, present=present, begun=begun)
 
     def _answer_history(self, query: Any, _at_ns: int) -> None:
         with query:

@@ -29,6 +29,7 @@ from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.swarm.control import LauncherEnd
 from zfusion.swarm.netns.addresses import places
+from zfusion.swarm.standstill import STANDSTILL_S, Standstill, is_stopped
 
 STOP_S = 15.0
 """How long a process that was told to stop may take: a node waits some seconds for its neighbours to hear it out."""
@@ -144,6 +145,7 @@ class Launcher:
         self._stop_by: float | None = None
         self._clock = Clock()
         self._clock.keep()
+        self._standstill = Standstill()
         self._begun = False
         """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
@@ -172,6 +174,7 @@ class Launcher:
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
+            self._note_unrecorded()
         finally:
             self._kill(self._everybody())
             self._selector.close()
@@ -260,6 +263,7 @@ class Launcher:
         self._start(network)
         while network.running and not network.status and not self._interrupts:
             self._look_after_all()
+            self._give_up_stopped()
         if self._interrupts:
             self._stop_nodes()
         elif network.status:
@@ -299,6 +303,7 @@ class Launcher:
         """Until every node's process has ended for good, or will not."""
         while any(child.running for child in self._nodes.values()):
             self._look_after_all()
+            self._give_up_stopped()
             self._dismiss_latecomers()
             if self._interrupts and self._stop_by is None:
                 self._options.on_message("stopping (once more kills)")
@@ -318,6 +323,20 @@ class Launcher:
             for child in running:
                 if child.line is not None:
                     child.line.stop()
+
+    def _give_up_stopped(self) -> None:
+        """End processes that somebody has stopped, where the run can only wait for them, and has for too long."""
+        awaited = self._nodes.values() if self._begun else self._everybody()
+        running = {c.name: c for c in awaited if c.running and c.blow is None}
+        processes = {name: c.process.pid for name, c in running.items() if c.process is not None}
+        for name in self._standstill.overdue(processes, begun=self._begun):
+            self._failures.append(
+                f"{name} was stopped{_step(running[name])} and not set going within {STANDSTILL_S:g} s: killed"
+            )
+            self._options.on_message(self._failures[-1])
+            self._kill([running[name]])
+            if not self._begun:
+                self._stop_nodes()
 
     def _look_after_all(self) -> None:
         self._clock.look()
@@ -402,7 +421,7 @@ class Launcher:
                 child.blow = None
                 child.restarts += 1
                 self._start(child)
-            elif child.process is not None and is_stopped(child.process.pid):
+            elif child.process is not None and is_stopped(child.process.pid) is not False:
                 child.blow = None
                 child.process.send_signal(signal.SIGCONT)
             else:
@@ -464,6 +483,12 @@ class Launcher:
             return None
         return RecorderReport(**self._recorder.reports[-1])
 
+    def _note_unrecorded(self) -> None:
+        """A swarm goes on without its recording, but it has not been recorded as it was to be."""
+        report = self._recorder_report()
+        if report is not None and report.stopped:
+            self._failures.append(f"{report.stopped}: {report.unrecorded} messages are not on the recording")
+
     def _network_report(self) -> Mapping[str, Any] | None:
         """What it told at its end; of one that died before, what it was."""
         network = self._network
@@ -521,14 +546,6 @@ def _own_ports() -> Iterator[int]:
 
 
 _ports = _own_ports()
-
-
-def is_stopped(pid: int) -> bool:
-    """Whether a process stands still, by a signal."""
-    state = Path(f"/proc/{pid}/stat")
-    if not state.exists():
-        return sys.platform != "linux"  # where that cannot be seen, it is taken at its word
-    return state.read_text().rpartition(")")[2].split()[0] == "T"
 
 
 def _let_finish(pid: int) -> None:
