@@ -6,7 +6,6 @@ Needs root and the kernel for it; where they are missing, the tests say so and a
 from __future__ import annotations
 
 import shutil
-import signal
 import socket
 from pathlib import Path
 
@@ -57,7 +56,8 @@ def test_a_router_that_is_killed_and_started_again(tmp_path: Path) -> None:
     with swarm(plan, tmp_path / "out") as running:
         wait_until(running.steps_taken, "steps are taken")
         said = running.commands["recorder"].said
-        running.commands["router-a"].process.send_signal(signal.SIGKILL)
+        running.commands["router-a"].process.kill()
+        running.commands["router-a"].process.wait()
         wait_until(lambda: all(f"node {i} is gone" in said() for i in "1234"), "the recorder sees nobody")
         running.start(process(plan, "router-a"))
         recorded_then = running.recording.stat().st_size

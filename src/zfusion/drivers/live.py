@@ -126,11 +126,10 @@ class LiveNode:
         self._complaints = Complaints()
         self._misfortune = Misfortune(scenario, node, announce)
         link = links_of(scenario) if options.emulate else ideal
-        config = scenario.transport.zenoh_config
         self._session = open_session(
             options.endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
-            config_file=scenario.absolute(config) if config else None,
+            config_file=scenario.zenoh_config,
             name=node_name(node),
         )
         try:
@@ -145,16 +144,9 @@ class LiveNode:
         self._hearing = self._hears()
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
+        why = prober(options.endpoints, scenario.zenoh_config)
         self._presence = Presence(
-            self,
-            self._meeting,
-            scenario,
-            self._graph,
-            options.run,
-            self._session,
-            self._inbox,
-            self._clock,
-            prober(options.endpoints, scenario.absolute(config) if config else None),
+            self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock, why
         )
 
     def run(self) -> NodeReport:

@@ -98,11 +98,10 @@ class Recorder:
         self._bell = f"{keys.recorder_token(run)}/bell"
         self._report = RecorderReport(str(writer.path))
         self._failed = False
-        config = scenario.transport.zenoh_config
         self._session = open_session(
             endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
-            config_file=scenario.absolute(config) if config else None,
+            config_file=scenario.zenoh_config,
             name=RECORDER_NAME,
         )
         self._clock = Clock()
