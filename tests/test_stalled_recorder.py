@@ -9,7 +9,7 @@ from pathlib import Path
 from swarms import Command, process_of, run_name, variant
 from test_supervision import ENDLESS, swarm
 from zfusion import keys
-from zfusion.drivers.transport import LEASE_MS
+from zfusion.drivers.settings import LEASE_MS
 from zfusion.recording import Recording
 
 RATE_HZ = 50.0
@@ -37,7 +37,7 @@ def test_a_recorder_that_stands_still_does_not_hold_up_a_paced_swarm(tmp_path: P
         assert recording.complete
         assert recording.statistics is not None
         gaps = recording.statistics[keys.stage_key(running.run, 1, "measurement")]
-    assert gaps.lost_between > lease
+    assert gaps.lost_between > 0
 
 
 def test_a_swarm_whose_recording_has_no_more_room_runs_to_its_end(tmp_path: Path) -> None:

@@ -83,10 +83,8 @@ def summarize(
     revised, too_late, stale (`EdgeCounters`), refused and incidents by name, clock_jumps and clock_offset_exceeded,
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
-    recording, and what the recorder says of it (recorder, `RecorderReport`);
-    the verdict on each edge, with its latencies and budget; rounds {node} (`latency.of_node`); what link
-    emulation did (emulated), what was planned to go wrong (faults), and what a network of namespaces did (network);
-    notes: what a user of the method must know of every run.
+    recording, recorder (`RecorderReport`); the verdict on each edge, with its latencies and budget; rounds {node}
+    (`latency.of_node`); emulated, faults, network: what links, plans and network namespaces did; notes on the method.
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
