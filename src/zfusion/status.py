@@ -93,7 +93,13 @@ class Status:
     estimate: Mapping[str, list[float]] = field(default_factory=dict)
     """The last one, where there is one: x, and sd, the standard deviations of its errors. For people to look at."""
     machine: str | None = None
-    """Of nodes that tell the same here the clocks are one; None where nothing can be said."""
+    """Nodes that tell the same here count the same time; None where nothing can be said."""
+    line_ns: int = 0
+    """Where the node's time line begins, on that count."""
+    clock_jumps: int = 0
+    """How often its machine's clock was seen to jump."""
+    clock_offset_exceeded: int = 0
+    """Readings of neighbours' clocks that were beyond what is allowed."""
     heard_ns: int = 0
     """When the question was heard that this answers, and when the answer was told, on the node's clock."""
     told_ns: int = 0
@@ -137,6 +143,9 @@ class Status:
                 fallbacks=_count(raw, "fallbacks", MAX_TIME_NS),
                 estimate=_vectors(raw, "estimate"),
                 machine=None if raw["machine"] is None else _typed(raw, "machine", str),
+                line_ns=_signed(raw, "line_ns"),
+                clock_jumps=_count(raw, "clock_jumps"),
+                clock_offset_exceeded=_count(raw, "clock_offset_exceeded"),
                 heard_ns=_count(raw, "heard_ns"),
                 told_ns=_count(raw, "told_ns"),
                 counts=Counts.from_map(raw["counts"]) if raw.get("counts") is not None else None,
@@ -163,6 +172,12 @@ class RecorderStatus:
     """Messages that had come and were not on the file yet when the question was heard."""
     path: str
     host: str
+    unrecorded: int = 0
+    """Messages that came and could not be written."""
+    overrun: int = 0
+    """Messages that came and were dropped unread, being too much at once."""
+    stopped: str = ""
+    """Why nothing is written any more, if that is so."""
 
     def encode(self) -> bytes:
         """As bytes."""
@@ -173,8 +188,9 @@ class RecorderStatus:
         """From bytes; MessageError if they are no such status."""
         raw = decode_any(data)
         try:
-            counts = {name: _typed(raw, name, int) for name in ("messages", "foreign", "lost", "waiting")}
-            return cls(**counts, path=_typed(raw, "path", str), host=_typed(raw, "host", str))
+            counts = ("messages", "foreign", "lost", "waiting", "unrecorded", "overrun")
+            words = {name: _typed(raw, name, str) for name in ("path", "host", "stopped")}
+            return cls(**{name: _typed(raw, name, int) for name in counts}, **words)
         except KeyError as missing:
             raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
 
@@ -234,6 +250,14 @@ def _number(value: object, name: str, most: int) -> int:
     if type(value) is not int:
         raise MessageError(Reason.WRONG_TYPE, f"{name}: expected int, is {value!r:.80}")
     if not 0 <= value <= most:
+        raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {value}")
+    return value
+
+
+def _signed(raw: Mapping[str, Any], name: str) -> int:
+    """A time of a clock that may be set to before 1970."""
+    value: int = _typed(raw, name, int)
+    if abs(value) > MAX_TIME_NS:
         raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {value}")
     return value
 

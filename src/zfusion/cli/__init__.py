@@ -13,7 +13,21 @@ import typer
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, experiment, library, live, logs, models, observe, recordings, report, soak
+from zfusion.cli import (
+    compare,
+    deploy,
+    doctor,
+    experiment,
+    library,
+    live,
+    logs,
+    models,
+    observe,
+    recordings,
+    repair,
+    report,
+    soak,
+)
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -35,6 +49,9 @@ for command in (
     observe.echo,
     observe.hz,
     observe.metrics,
+    deploy.deploy,
+    deploy.router,
+    doctor.doctor,
     models.design,
     compare.compare,
     compare.worst,
@@ -42,6 +59,9 @@ for command in (
     recordings.replay,
     recordings.info,
     recordings.export,
+    repair.recover,
+    repair.merge,
+    repair.cut,
     report.report,
     soak.soak,
 ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -44,6 +45,10 @@ Loss = Annotated[
 RunName = Annotated[str | None, typer.Option("--run", help="Name of the run.", show_default="made up")]
 Connect = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to dial; may be repeated.")]
 Listen = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on; may be repeated.")]
+ZenohConfig = Annotated[
+    Path | None,
+    typer.Option("--zenoh-config", help="This process' Zenoh configuration.", show_default="the scenario's"),
+]
 ControlFd = Annotated[int | None, typer.Option(hidden=True)]
 
 
@@ -57,6 +62,7 @@ def load(
     links: Path | None = None,
     loss: float | None = None,
     delay: float | None = None,
+    zenoh_config: Path | None = None,
 ) -> Scenario:
     """The scenario of a file with what the command line says instead; InputError for what is wrong with it.
 
@@ -73,6 +79,7 @@ def load(
         links=links,
         loss=loss,
         delay=delay,
+        zenoh_config=zenoh_config,
     )
     loaded = load_scenario(path, **overrides)
     check_method(loaded, str(path))
@@ -139,6 +146,17 @@ def epoch_ns(text: str) -> int:
     if epoch.tzinfo is None:
         raise InputError(f"--epoch: expected a time with its offset, like 2026-01-31T12:00:00Z (is {text!r})")
     return round(epoch.timestamp() * 1000) * 1_000_000
+
+
+def steps_range(text: str | None) -> range | None:
+    """``A:B``, both included, or ``A``; InputError for anything else."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", text)
+    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    if not 1 <= first <= last:
+        raise InputError(f"--steps: expected first:last, like 100:112 (is {text!r})")
+    return range(first, last + 1)
 
 
 def finish(result: Mapping[str, Any], as_json: bool, show: Callable[[], None]) -> None:

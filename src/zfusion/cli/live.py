@@ -26,6 +26,7 @@ from zfusion.cli.common import (
     Seed,
     Steps,
     ToldTo,
+    ZenohConfig,
     control_of,
     default_directory,
     epoch_ns,
@@ -184,6 +185,7 @@ def node(
     run: RunName = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     epoch: Annotated[str | None, typer.Option(help="When step 0 is (RFC 3339).", show_default="agreed on")] = None,
     await_recorder: Annotated[bool, typer.Option(help="Begin only when a recorder is there.")] = False,
     forever: Annotated[bool, typer.Option("--forever", help="Take steps until stopped.")] = False,
@@ -201,7 +203,7 @@ def node(
 
     control = control_of(control_fd, deadly=True)
     with ToldTo(control):
-        loaded = load(scenario, steps, rate, free_run, seed, method)
+        loaded = load(scenario, steps, rate, free_run, seed, method, zenoh_config=zenoh_config)
         own = node_named(loaded, node_id)
         options = LiveOptions(
             run=given_run(run, loaded),
@@ -242,6 +244,7 @@ def record(
     run: RunName = None,
     connect: Connect = None,
     listen: Listen = None,
+    zenoh_config: ZenohConfig = None,
     network: Annotated[NetnsKind | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
     control_fd: ControlFd = None,
@@ -251,24 +254,26 @@ def record(
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
-    from zfusion.recording.writer import RecordingWriter
+    from zfusion.recording import Keeping, RecordingWriter
 
     control = control_of(control_fd, deadly=False)
     with ToldTo(control):
-        loaded = load_scenario(scenario)
+        as_written = load_scenario(scenario)
+        loaded = as_written.with_overrides(zenoh_config=zenoh_config)
         name = given_run(run, loaded)
         logs.about(name)
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
             output,
-            scenario_toml=loaded.anchored().to_toml(),
+            scenario_toml=as_written.anchored().to_toml(),  # where keys are kept is nobody's business
             run=name,
             method=method,
             seed=loaded.seed,
             stages=chosen(loaded).stages,
             design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
+            keeping=Keeping.of(loaded.recording),
         )
         tell = None if control is None else lambda report: control.tell(status=asdict(report))
         endpoints = recorder_endpoints(loaded, connect, listen)
@@ -282,6 +287,9 @@ def record(
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+    if report["stopped"]:
+        err.print(f"{report['stopped']}: {report['unrecorded']} messages are not on the recording", soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def noted(

@@ -210,13 +210,15 @@ def _verdict(failures: Sequence[str], growth: Sequence[Growth]) -> str:
 def _counters(summary: Mapping[str, Any]) -> dict[str, int]:
     """Of the whole run and all nodes."""
     edges = summary["edges"]
+    lost = sum(edge["lost"] for edge in edges)
     return {
         "completed": sum(summary["completed_steps"].values()),
         "skipped": summary["skipped"],
         "received": sum(edge["received"] for edge in edges),
         "missed": summary["missed"],
         "late": summary["late"],
-        "lost": summary["lost"],
+        "lost": lost,
+        "unrecorded": summary["lost"] - lost,
         "refused": sum(summary["refused"].values()),
         "fallbacks": summary["fallbacks"],
     }

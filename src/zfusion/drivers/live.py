@@ -17,12 +17,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
-from typing import Any
+from typing import Any, cast
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
-from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.clocks import Clock, machine
 from zfusion.drivers.complaints import Complaints
+from zfusion.drivers.credentials import node_name
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.health import health
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
@@ -34,7 +35,7 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, closing, never_linger, open_session, publisher
+from zfusion.drivers.transport import RECEIPT, closing, never_linger, open_session, prober, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
@@ -130,13 +131,14 @@ class LiveNode:
             options.endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
             config_file=scenario.absolute(config) if config else None,
+            name=node_name(node),
         )
         try:
             self._source: Source = open_source(scenario, node, self._subscribe)
         except InputError:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
-        self._clock = WrongClock() if self._misfortune.clock_goes_wrong else Clock()
+        self._clock = Clock()
         self._now = self._clock.now
         self._inbox = Inbox(self._session, self._clock)
         self._links = link if isinstance(link, LinkNetwork) else None
@@ -148,7 +150,15 @@ class LiveNode:
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
         self._presence = Presence(
-            self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock
+            self,
+            self._meeting,
+            scenario,
+            self._graph,
+            options.run,
+            self._session,
+            self._inbox,
+            self._clock,
+            prober(options.endpoints, scenario.absolute(config) if config else None),
         )
 
     def run(self) -> NodeReport:
@@ -191,6 +201,9 @@ class LiveNode:
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
             counts=self._counts() if counted else None,
+            line_ns=self._clock.line_ns,
+            clock_jumps=self._clock.jumps,
+            clock_offset_exceeded=self._presence.clocks.exceeded,
         )
 
     def health(self, node: Node, account: Account) -> dict[str, Any]:
@@ -215,6 +228,7 @@ class LiveNode:
             refused["too_early"] = refused.get("too_early", 0) + 1
         report.overheard = self._overheard(report.overheard)
         report.clocks = self._clocks()
+        report.clock_jumps, report.clock_offset_exceeded = self._clock.jumps, self._presence.clocks.exceeded
         report.queues = self._queues()
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
@@ -234,7 +248,7 @@ class LiveNode:
         return dict(Counter(by_source) + self._presence.overheard + here)
 
     def _clocks(self) -> dict[str, dict[str, float]]:
-        return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+        return {str(j): told for j, offset in self._presence.clocks.offsets.items() if (told := offset.told())}
 
     def _queues(self) -> dict[str, int]:
         return {"ahead": self._most_ahead, "held": self._hearing.most_held}
@@ -442,6 +456,7 @@ class LiveNode:
         """Tell what was measured of the neighbours' messages, when it is time to."""
         assert self._account is not None  # steps are taken with one
         for message in self._account.arrivals(self._now(), ended=ended):
+            self._presence.clocks.mark(cast("dict[str, Any]", message.fields["data"]))
             self._publish[ARRIVALS.name](encode(message))
 
     def _tell_truth(self, node: Node, step: int, now: int) -> None:
@@ -470,6 +485,7 @@ class LiveNode:
 
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
+        self._look_at_clock()
         self._told_ns = self._now()
         if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
             self._lingerless_ns = self._told_ns
@@ -485,6 +501,13 @@ class LiveNode:
             refused: dict[str, Mapping[str, int]] = {f"node {j}": c.refused for j, c in self.node.counters.items()}
             refused["elsewhere"] = self._overheard(self._source.counters)
             self._complaints.look(self._now(), refused, ended=ended)
+
+    def _look_at_clock(self) -> None:
+        """See whether the machine's clock has jumped; this node's time goes on as before, but it is told."""
+        jump = self._clock.look()
+        if jump is not None and self.node is not None:
+            log.warning("the machine's clock has jumped: %s", jump)
+            self._carry_out([self.node.event("clock_jump", self._now(), **jump._asdict())])
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""

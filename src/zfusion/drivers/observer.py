@@ -23,6 +23,7 @@ import zenoh
 
 from zfusion import keys
 from zfusion.drivers import registry
+from zfusion.drivers.credentials import OBSERVER_NAME
 from zfusion.drivers.endpoints import Endpoints, listens_at
 from zfusion.drivers.inbox import Wake
 from zfusion.drivers.transport import on_zenoh_thread, open_session
@@ -247,7 +248,9 @@ class Observer:
         self._runs: set[str] = set()
         self._news: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
         self._listening: list[Any] = []
-        self._session = open_session(swarm.endpoints, low_latency=swarm.low_latency, config_file=swarm.config)
+        self._session = open_session(
+            swarm.endpoints, low_latency=swarm.low_latency, config_file=swarm.config, name=OBSERVER_NAME
+        )
         liveliness, hear = self._session.liveliness(), on_zenoh_thread(self._hear_token)
         run = swarm.run or "*"
         self._tokens = [

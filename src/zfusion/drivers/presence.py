@@ -19,10 +19,12 @@ import zenoh
 
 from zfusion import keys
 from zfusion.drivers.claims import Claims
-from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock, ClockOffset
+from zfusion.drivers.clock_watch import ClockWatch
+from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock
 from zfusion.drivers.endpoints import linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
+from zfusion.drivers.probe import Prober
 from zfusion.drivers.transport import never_linger, on_zenoh_thread
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Reason, decode_any, encode_any
@@ -88,6 +90,7 @@ class Presence:
         session: zenoh.Session,
         inbox: Inbox,
         clock: Clock,
+        prober: Prober,
     ) -> None:
         self.meeting = meeting
         self._now = clock.now
@@ -98,7 +101,7 @@ class Presence:
         self.strangers: set[NodeId] = set()
         """Neighbours that run something else than this node."""
         self._host, self._scenario, self._graph, self._run = host, scenario, graph, run
-        self._session, self._inbox = session, inbox
+        self._session, self._inbox, self._prober = session, inbox, prober
         self._unconfirmed: set[NodeId] = set()
         """Who has not said yet that it has this node's last messages."""
         self._leaving: set[NodeId] = set()
@@ -108,8 +111,9 @@ class Presence:
         self._claims = Claims(meeting.own)
         self._token: Any = None
         self._kept: list[Any] = []
-        self.clocks = {j: ClockOffset() for j in meeting.linked}
+        self.clocks = ClockWatch(scenario, meeting.own, meeting.linked, clock)
         """How far the neighbours' clocks are ahead of this node's."""
+        self._clock = clock
         self._read_clocks_ns = 0
 
     def declare(self) -> None:
@@ -125,21 +129,35 @@ class Presence:
         self._show_token()
 
     def join(self) -> Start | None:
-        """Wait until it is time to begin; None if stopped before. InputError where somebody runs something else."""
+        """Wait until it is time to begin; None if stopped before.
+
+        InputError where somebody runs something else, or has a clock that is too far off.
+        """
         next_poll = self._now()
         next_word = next_poll + WORD_NS
+        line = self._clock.line_ns
         while not self._host.stopping:
             try:
                 self.handle_notices()
+                self.clocks.agree(self.meeting.agrees_with())
             except InputError:
                 self._be_refused()
                 raise
             now = self._now()
+            if moved := self._clock.line_ns - line:
+                line += moved
+                next_poll += moved
+                next_word += moved
+                self.meeting.moved_ns += moved
             self._claims.check(now)
             self._show_token()
             start = None if self._claims.contested else self.meeting.start(now)
             if start is not None:
+                self._clock.keep()
+                self.clocks.tell_unknown(self.meeting.present)
                 return start
+            if self.meeting.epoch_ns is not None and not self.meeting.fixed_epoch:
+                self._clock.keep()  # it was agreed on by what the clocks say now
             if now >= next_poll:
                 next_poll = now + POLL_NS
                 for j in self.meeting.present:
@@ -148,6 +166,8 @@ class Presence:
             if now >= next_word:
                 next_word = now + WORD_NS
                 log.warning("waiting for %s", ", ".join(self.meeting.missing()))
+                if not self.meeting.linked <= self.meeting.present:
+                    self._prober.look()
             self._inbox.rest(next_poll)
         return None
 
@@ -179,8 +199,8 @@ class Presence:
         """Ask the neighbours on other machines for the time, if it is time to."""
         if now_ns >= self._read_clocks_ns:
             self._read_clocks_ns = now_ns + ASK_AGAIN_NS
-            for j, clock in self.clocks.items():
-                if j in self.meeting.present and not clock.same_machine:
+            for j, clock in self.clocks.offsets.items():
+                if j in self.meeting.present and clock.error_ns != 0:
                     self._ask_status(j)
 
     def ask_history(self, j: NodeId) -> None:
@@ -243,9 +263,9 @@ class Presence:
 
     def _be_refused(self) -> None:
         """Stay until those who are there have been told, too, what this node runs: they are to say so themselves."""
-        end = self._now() + int(ANSWER_S * 1e9)
-        while not self._host.stopping and not self.meeting.present <= self._answered and self._now() < end:
-            self._inbox.rest(end)
+        end = time.monotonic() + ANSWER_S
+        while not self._host.stopping and not self.meeting.present <= self._answered and time.monotonic() < end:
+            self._inbox.rest(self._now() + POLL_NS)
             with suppress(InputError):
                 self.handle_notices()
 
@@ -296,7 +316,7 @@ class Presence:
         if status.node != j:
             raise MessageError(Reason.WRONG_NODE, f"{status.node} answers for {j}")
         self._unconfirmed.discard(j)
-        self._read_clock(status, about[2], at_ns)
+        self.clocks.read(status, self._host.status().machine, about[2], at_ns, begun=node is not None)
         self._claims.answered(j, status.holder_ns)
         if node is None:
             self.meeting.answered(status)
@@ -310,13 +330,6 @@ class Presence:
         self.strangers.discard(j)
         if j in self.meeting.hears and j in self.meeting.present and status.phase is not Phase.DONE:
             node.back(j)
-
-    def _read_clock(self, status: Status, asked_ns: int, answered_ns: int) -> None:
-        """What an answer tells of its sender's clock."""
-        clock, own = self.clocks.get(status.node), self._host.status().machine
-        if clock is not None:
-            clock.same_machine = own is not None and status.machine == own
-            clock.read(asked_ns, status.heard_ns, status.told_ns, answered_ns)
 
     def _on_history(self, about: tuple[NodeId, Any, int], _at_ns: int) -> None:
         of, reply, node = about[0], about[1].ok, self._host.node

@@ -7,68 +7,89 @@ liveliness tokens say who is there (docs/live.md).
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import os
 import socket
 import stat
 import struct
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
-    "(rx: (handover: app), acc: (handover: app), tx: (handover: app), net: (handover: app), app: (worker_threads: 1))",
-)  # one thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on
+    "(rx: (handover: app), acc: (handover: app), tx: (handover: app), net: (handover: app), "
+    "app: (worker_threads: 1, max_blocking_threads: 50))",
+)
+# One thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on. Beside
+# it there are those that wait for something, of which it makes more and more where links come and go under load.
 
 import zenoh
 
+from zfusion.drivers.credentials import RENEW, Credentials, prove
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.probe import Prober, Route
+from zfusion.drivers.settings import base_settings
 from zfusion.errors import InputError
 
 log = logging.getLogger(__name__)
 
-RETRY = {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}
-"""A neighbour that comes up soon is linked within 20 ms, one that was away for long within a quarter of a second."""
+HEAPS = 2
+"""Of the C library, in the place of eight a processor. Zenoh works with some dozens of threads that come and go, and
+each of them fills whatever heap it finds free: a recorder of 32 nodes was at 117 MiB after a quarter of an hour and
+growing, 69 MiB of them in 15 heaps."""
 
-LEASE_MS = 2000
-"""A peer that neither closes nor answers (stopped, cut off) counts as gone after this; one that dies, at once."""
+_M_ARENA_MAX = -8
 
-BLOCK_US = 60_000_000
-"""How long a put may wait for a full link before Zenoh closes it and drops what is queued. Links are full when a peer
-is slower than we are, which is no reason to lose its messages."""
+with suppress(OSError, AttributeError):  # other C libraries than glibc do not have it
+    ctypes.CDLL(None).mallopt(_M_ARENA_MAX, HEAPS)
 
-MAX_RECEIVED = 16 << 20
-"""Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times
-what zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
+SOON = timedelta(days=14)
+"""How long before it expires a certificate is spoken of."""
 
-LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
-"""About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
+UNREACHED = "Unable to connect to any of"
+"""What Zenoh says when a client reaches none of its routers."""
 
+AGAIN_S = 0.25
+"""How soon a client tries its routers again."""
+
+WORD_S = 5.0
+"""How often it is said that one is waited for."""
 
 RECEIPT = zenoh.TimestampInstrumentationBuilder().set_receive(True).build()
 """Has the receiving session stamp a message when it comes: 5 to 10 µs of work at each end."""
 
 
 def open_session(
-    endpoints: Endpoints, *, low_latency: bool = False, config_file: Path | None = None, mode: str = "peer"
+    endpoints: Endpoints,
+    *,
+    low_latency: bool = False,
+    config_file: Path | None = None,
+    mode: str = "peer",
+    name: str | None = None,
 ) -> zenoh.Session:
     """An open Zenoh session; InputError, naming the endpoint or file, where Zenoh refuses it.
 
-    A user's `config_file` comes first; the endpoints, where given, replace its own.
+    A user's `config_file` comes first; the endpoints, where given, replace its own. Where it has certificates they are
+    proven first, as those of `name` where there are rules about names.
     """
-    config = _base_config(config_file, mode, low_latency)
-    if endpoints.listen:
-        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
-    if endpoints.connect:
-        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
+    config = _config(endpoints, config_file, mode, low_latency)
+    _prove(config, name)
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
         raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+
+
+def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
+    """What can say why those that a session dials do not come; given what the session is opened with."""
+    return _prober(_config(endpoints, config_file=config_file))
 
 
 @contextmanager
@@ -121,6 +142,48 @@ def on_zenoh_thread(callback: Callable[[Any], None]) -> Any:
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
+def _config(
+    endpoints: Endpoints, config_file: Path | None = None, mode: str = "peer", low_latency: bool = False
+) -> zenoh.Config:
+    config = _base_config(config_file, mode, low_latency)
+    if endpoints.listen:
+        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
+    if endpoints.connect:
+        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
+    return config
+
+
+def _opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; a client's when one of its routers is there, which Zenoh does not wait for."""
+    next_word = time.monotonic()
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if _setting(config, "mode") != "client" or UNREACHED not in str(error):
+                raise
+        if time.monotonic() >= next_word:
+            next_word = time.monotonic() + WORD_S
+            log.warning("waiting for a router")
+            _prober(config).look()
+        time.sleep(AGAIN_S)
+
+
+def _setting(config: zenoh.Config, path: str) -> Any:
+    return json.loads(config.get_json(path))
+
+
+def _prober(config: zenoh.Config) -> Prober:
+    dialled = _setting(config, "connect/endpoints")
+    if isinstance(dialled, dict):  # by the mode of the session
+        dialled = dialled.get(_setting(config, "mode"), [])
+    credentials = Credentials.of(_setting(config, "transport/link/tls"))
+    subjects = _setting(config, "access_control/subjects") or []
+    names = frozenset(name for subject in subjects for name in subject.get("cert_common_names") or ())
+    connecting = credentials[-1] if credentials else None
+    return Prober([Route(endpoint, connecting, names) for endpoint in dialled if isinstance(endpoint, str)])
+
+
 def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zenoh.Config:
     if config_file is not None:
         try:
@@ -130,25 +193,19 @@ def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zeno
         config.insert_json5("timestamping/enabled", "true")
         return config
     config = zenoh.Config()
-    settings = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 1,  # nothing is scouted: do not wait for it
-        "listen/endpoints": [],
-        "connect/endpoints": [],
-        "connect/timeout_ms": -1,  # keep trying, in the background
-        "connect/exit_on_failure": False,
-        "connect/retry": RETRY,
-        "timestamping/enabled": True,
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
-        "transport/link/rx/max_message_size": MAX_RECEIVED,
-        "transport/shared_memory/enabled": False,
-    }
-    for key, value in (settings | (LOW_LATENCY if low_latency else {})).items():
+    for key, value in base_settings(mode, low_latency=low_latency).items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _prove(config: zenoh.Config, name: str | None) -> None:
+    """See that the certificates of a configuration are good, before Zenoh waits with them for ever."""
+    by_names = _setting(config, "access_control/enabled")
+    for credentials in Credentials.of(_setting(config, "transport/link/tls")):
+        proven = prove(credentials, common_name=name if by_names else None)
+        left = proven.ends - datetime.now(UTC)
+        if left < SOON:
+            log.warning("%s expires in %d days: %s", credentials.certificate, left.days, RENEW)
 
 
 def _listed(endpoints: Sequence[str]) -> str:

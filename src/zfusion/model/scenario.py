@@ -14,7 +14,7 @@ import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +74,7 @@ class Overrides(TypedDict, total=False):
     links: str | Path | None
     loss: float | None
     delay: float | None
+    zenoh_config: str | Path | None
 
 
 class Scenario(Spec):
@@ -203,20 +204,20 @@ class Scenario(Spec):
 
     def anchored(self) -> Self:
         """The same scenario with absolute paths, to be written to another directory."""
+        return self.with_paths(lambda path: str(self.absolute(path)))
 
-        def here(path: str) -> str:
-            return str(self.absolute(path))
-
+    def with_paths(self, changed: Callable[[str], str]) -> Self:
+        """The same with every path in it replaced by what `changed` makes of it."""
         sensors = tuple(
-            sensor.model_copy(update={"source": sensor.source.with_paths(here)}) if sensor.source else sensor
+            sensor.model_copy(update={"source": sensor.source.with_paths(changed)}) if sensor.source else sensor
             for sensor in self.sensors
         )
         pieces = {
-            name: getattr(self, name).with_paths(here)
+            name: getattr(self, name).with_paths(changed)
             for name in ("source", "transport", "recording", "links", "method")
         }
-        changed = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
-        document = self._document() | changed | {"sensors": sensors}
+        others = {name: piece for name, piece in pieces.items() if piece != getattr(self, name)}
+        document = self._document() | others | {"sensors": sensors}
         return self._from_document(document, self._origin, self._directory)
 
     def carrying(self, design: bytes | None) -> Self:
@@ -364,6 +365,9 @@ def _overridden(document: Mapping[str, Any], overrides: Overrides) -> dict[str, 
     links = changed.get("links", {})
     if of_links and isinstance(links, Mapping):
         changed["links"] = {**links, **of_links}
+    transport = document.get("transport", {})
+    if "zenoh_config" in given and isinstance(transport, Mapping):
+        changed["transport"] = {**transport, "zenoh_config": str(Path(str(given["zenoh_config"])).absolute())}
     method = document.get("method")
     if "method" in given and given["method"] != (method.get("name") if isinstance(method, Mapping) else method):
         changed["method"] = {"name": given["method"]}

@@ -25,8 +25,6 @@ MIB = 2.0**20
 RATES = {"missed": "missed", "late": "late", "lost": "lost", "refused": "refused", "skipped": "skipped steps"}
 """Counters whose growth per second is drawn, and their labels."""
 
-_Values = dict[str, "Array"]
-
 
 def write_report(
     directory: Path, told: Mapping[str, Any], courses: Sequence[Course], growth: Sequence[Growth], stages: Sequence[str]
@@ -46,11 +44,16 @@ def _in_short(told: Mapping[str, Any]) -> Section:
         ("verdict", told["verdict"]),
         ("steps", f"{counts['completed']} completed by all nodes together, {counts['skipped']} skipped"),
         ("messages between nodes", f"{counts['received']} in time, {counts['missed']} not there at a deadline"),
-        ("of these", f"{counts['late']} late, {counts['lost']} lost, {counts['refused']} refused"),
+        ("of these", f"{counts['late']} late, {counts['lost']} lost on the way, {counts['refused']} refused"),
         ("samples", f"{told['samples']} of {told['processes']} processes"),
     ]
     if told["recording"] is not None:
-        rows.append(("recording", f"{told['recording_bytes'] / MIB:.1f} MiB, {told['recorded']} messages"))
+        rows.append(
+            (
+                "recording",
+                f"{told['recording_bytes'] / MIB:.1f} MiB, {told['recorded']} messages, {counts['unrecorded']} missing",
+            )
+        )
     if told["unwritten"]:
         rows.append(("samples not written", str(told["unwritten"])))
     return Section("short", "In short", tables=[Table(("", ""), rows)], warnings=list(told["failures"]))
@@ -110,17 +113,17 @@ def _pictures(
         "lateness",
         "Lateness",
         f"{band} Medians and 99 % quantiles of each interval.",
-        [figure.Panel(f"{name} [ms]", _quantiles(nodes, name)) for name in (ROUND, *stages)],
+        [figure.Panel(f"{name} [ms]", _quantiles(nodes, name), logarithmic=True) for name in (ROUND, *stages)],
     )
     rates = [_total(label, nodes, name) for name, label in RATES.items()]
     yield "trouble", "What went wrong", "All nodes together.", [figure.Panel("per second", [r for r in rates if r])]
-    disk = [_of_one(LAUNCHER, courses, name, 1 / MIB, label) for name, label in _DISK]
-    yield "disk", "Written", "Recording and logs.", [figure.Panel("MiB", [line]) for line in disk if line]
+    disk = [(unit, _of_one(LAUNCHER, courses, column, scale, label)) for column, label, unit, scale in _DISK]
+    yield "disk", "Written", "Recording and logs.", [figure.Panel(unit, [line]) for unit, line in disk if line]
 
 
 _MEMORY = (("USS", "uss"), ("RSS", "rss"))
 
-_DISK = (("recording_bytes", "recording"), ("logs_bytes", LOGS.name))
+_DISK = (("recording_bytes", "recording", "MiB", 1 / MIB), ("logs_bytes", LOGS.name, "KiB", 1 / 1024))
 
 
 def _panel(y: str, courses: Sequence[Course], column: str, scale: float = 1.0) -> figure.Panel:

@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
@@ -142,6 +143,8 @@ class Launcher:
         self._failures: list[str] = []
         self._interrupts = 0
         self._stop_by: float | None = None
+        self._clock = Clock()
+        self._clock.keep()
         self._standstill = Standstill()
         self._begun = False
         """Whether the swarm was seen to run."""
@@ -171,6 +174,7 @@ class Launcher:
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
+            self._note_unrecorded()
         finally:
             self._kill(self._everybody())
             self._selector.close()
@@ -335,6 +339,7 @@ class Launcher:
                 self._stop_nodes()
 
     def _look_after_all(self) -> None:
+        self._clock.look()
         for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
         for child in self._everybody():
@@ -426,7 +431,7 @@ class Launcher:
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
         if blow["until_ns"] is not None:
-            left: float = (blow["until_ns"] - time.time_ns()) / 1e9
+            left: float = (blow["until_ns"] - self._clock.now()) / 1e9
             return left
         others = [other for other in self._nodes.values() if other is not child and other.running]
         reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
@@ -477,6 +482,12 @@ class Launcher:
         if self._recorder is None or not self._recorder.reports:
             return None
         return RecorderReport(**self._recorder.reports[-1])
+
+    def _note_unrecorded(self) -> None:
+        """A swarm goes on without its recording, but it has not been recorded as it was to be."""
+        report = self._recorder_report()
+        if report is not None and report.stopped:
+            self._failures.append(f"{report.stopped}: {report.unrecorded} messages are not on the recording")
 
     def _network_report(self) -> Mapping[str, Any] | None:
         """What it told at its end; of one that died before, what it was."""

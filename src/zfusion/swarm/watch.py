@@ -140,6 +140,8 @@ class Watch:
                 process = self._processes[pid] = psutil.Process(pid)
             with process.oneshot():
                 memory, times = process.memory_full_info(), process.cpu_times()
+                if not memory.rss:
+                    return {}  # it has just ended
                 return {
                     "pid": pid,
                     "uss_bytes": memory.uss,

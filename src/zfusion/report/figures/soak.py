@@ -11,11 +11,15 @@ from matplotlib.figure import Figure
 
 from zfusion.model.types import Array
 from zfusion.report.figures import style
+from zfusion.report.figures.quantities import spans_decades
 
 MOST_POINTS = 600
 """Samples that a line shows; of more, means over as many equal blocks."""
 
 PANEL_HEIGHT_IN = 2.0
+
+DASHES: tuple[style.LineStyle, ...] = ("-", "--", "-.", ":")
+"""No colour carries a meaning alone, and lines may lie on one another."""
 
 UNITS = (("h", 3600.0, 7200.0), ("min", 60.0, 180.0), ("s", 1.0, 0.0))
 """Of the time axis, in seconds, and the least length of a run from which on each is used."""
@@ -38,6 +42,8 @@ class Panel:
 
     y: str
     lines: Sequence[Line]
+    logarithmic: bool = False
+    """Where its values span decades."""
 
 
 def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
@@ -52,9 +58,13 @@ def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
         unit, scale = next((name, size) for name, size, least in UNITS if longest >= least)
         for ax, panel in zip(axes, panels, strict=True):
             for number, line in enumerate(panel.lines):
-                _draw(ax, line, style.COLOURS[number % len(style.COLOURS)], scale)
+                _draw(ax, line, number, scale)
             ax.axvspan(0, warm_up_s / scale, color=style.GREY, alpha=0.10, linewidth=0)
-            ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
+            if panel.logarithmic and spans_decades(_positive(panel)):
+                ax.set_yscale("log")
+                style.tick_logarithmically(ax.yaxis)
+            else:
+                ax.set_ylim(0, None if ax.dataLim.y1 > 0 else 1)
             ax.set_xlim(0, longest / scale)
             ax.set_ylabel(panel.y)
             ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -62,11 +72,18 @@ def draw(panels: Sequence[Panel], warm_up_s: float) -> Figure:
         return figure
 
 
-def _draw(ax: Axes, line: Line, colour: str, scale: float) -> None:
+def _positive(panel: Panel) -> list[float]:
+    drawn = (values for line in panel.lines for values in (line.values, line.low, line.high) if values is not None)
+    values = np.concatenate(list(drawn))
+    return [value for value in values.tolist() if value > 0]
+
+
+def _draw(ax: Axes, line: Line, number: int, scale: float) -> None:
+    colour, dashes = style.COLOURS[number % len(style.COLOURS)], DASHES[number % len(DASHES)]
     t, values = _blocks(line.t_s) / scale, _blocks(line.values)
     if line.low is not None and line.high is not None:
         ax.fill_between(t, _blocks(line.low), _blocks(line.high), color=colour, alpha=0.2, linewidth=0, gid="range")
-    ax.plot(t, values, color=colour, linewidth=1.2, label=line.label, gid="measured")
+    ax.plot(t, values, color=colour, linestyle=dashes, linewidth=1.2, label=line.label, gid="measured")
 
 
 def _blocks(values: Array) -> Array:

@@ -1,0 +1,51 @@
+"""Commands for swarms on many machines: deploy, router."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zfusion.cli.common import Json, ScenarioFile, finish, load, on_signals, out
+
+
+def deploy(
+    scenario: ScenarioFile,
+    hosts: Annotated[Path, typer.Option(help="Hosts file (TOML).", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Directory for the hosts' folders.", show_default=False)
+    ],
+    renew: Annotated[bool, typer.Option("--renew", help="Make all certificates anew, under the same CA.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a folder for every host: Zenoh configurations, certificates and keys, access control, and the scenario."""
+    from zfusion.deploy.folders import write
+    from zfusion.deploy.hosts import HostsFile
+    from zfusion.deploy.plan import Plan
+    from zfusion.keys import check_run
+
+    loaded = load(scenario)
+    placed = HostsFile.load(hosts, loaded)
+    written = write(Plan(loaded, placed, check_run(placed.run or scenario.stem)), output, renew=renew)
+
+    def show() -> None:
+        for name in written.folders:
+            out.print(f"{output / name}")
+        made, kept = len(written.certificates_made), len(written.certificates_kept)
+        out.print(f"run {written.run}: {made} certificates made, {kept} kept")
+        for name in written.stale:
+            out.print(f"{output / name}: no host of this deployment any more; left as it is")
+
+    finish(written.told(), as_json, show)
+
+
+def router(
+    zenoh_config: Annotated[Path, typer.Option(help="Zenoh configuration of the router.", show_default=False)],
+) -> None:
+    """Run a Zenoh router, where there is no zenohd: the same configuration works with either. Ends with Ctrl-C."""
+    from zfusion.drivers.router import Router
+
+    running = Router(zenoh_config)
+    on_signals(running.stop)
+    running.run()

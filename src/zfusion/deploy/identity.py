@@ -1,0 +1,122 @@
+"""Who is who: a small CA and a certificate for each process of a plan, or a user's own, checked and copied.
+
+What is there and still good is kept, so that a deployment can be written again; `renew` makes all certificates anew,
+under the same CA. Keys never leave the files: they are not logged, recorded or passed on command lines.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from zfusion.deploy.plan import Plan, Process
+from zfusion.deploy.zenoh_file import AUTHORITY
+from zfusion.drivers.credentials import Credentials, prove
+from zfusion.errors import InputError
+
+if TYPE_CHECKING:
+    from zfusion.deploy.authority import Authority
+
+CA_FOLDER = "ca"
+"""Beside the hosts' folders; its key stays at home."""
+
+CA_DAYS = 3650
+"""How long the CA is valid at least: longer than the certificates, which are renewed under it."""
+
+
+def private_directory(path: Path) -> Path:
+    """A directory that only its owner may look into, made if need be."""
+    path.mkdir(parents=True, exist_ok=True)
+    path.chmod(0o700)
+    return path
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only its owner may read, and that was never to be read by others."""
+    path.unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+
+
+def credentials_of(folder: Path, process: Process) -> Credentials:
+    """A process' files in its host's folder."""
+    return Credentials(folder / AUTHORITY, folder / process.certificate, folder / process.key)
+
+
+class Identities:
+    """The certificates of a plan's processes. InputError where the extra is missing that makes them."""
+
+    def __init__(self, plan: Plan, directory: Path, *, renew: bool = False) -> None:
+        """`directory` is that of the hosts' folders."""
+        self._plan, self._directory, self._renew = plan, directory, renew
+        self._security = plan.hosts.security
+        self.kept: list[str] = []
+        """Whose certificates were good and stay."""
+        self.made: list[str] = []
+        """Who has got new ones."""
+        self._authority = None if self._security.certificates else self._given() or self._own()
+
+    def write(self, process: Process) -> None:
+        """See to it that a process has its files in its host's folder; InputError where its own are no good."""
+        folder = self._directory / process.host
+        private_directory(folder / "tls")
+        address = self._plan.hosts.hosts[process.host].address
+        credentials = credentials_of(folder, process)
+        if self._authority is None:
+            self._copy(process, credentials, address)
+            return
+        if not self._renew and self._still_good(credentials, process, address):
+            self.kept.append(f"{process.host}/{process.name}")
+            return
+        credentials.authority.write_bytes(self._authority.pem)
+        certificate, key = self._authority.issue(process.name, address, self._security.days)
+        write_private(credentials.key, key)
+        credentials.certificate.write_bytes(certificate)
+        prove(credentials, common_name=process.name, address=address)
+        self.made.append(f"{process.host}/{process.name}")
+
+    def _still_good(self, credentials: Credentials, process: Process, address: str) -> bool:
+        assert self._authority is not None  # the caller has looked
+        try:
+            prove(credentials, common_name=process.name, address=address)
+        except InputError:
+            return False
+        return credentials.authority.read_bytes() == self._authority.pem
+
+    def _copy(self, process: Process, credentials: Credentials, address: str) -> None:
+        """A user's own certificate, if it is good."""
+        own = Path(str(self._security.certificates))
+        given = Credentials(own / "ca.pem", own / f"{process.name}.pem", own / f"{process.name}.key")
+        prove(given, common_name=process.name, address=address)
+        credentials.authority.write_bytes(given.authority.read_bytes())
+        write_private(credentials.key, given.key.read_bytes())
+        credentials.certificate.write_bytes(given.certificate.read_bytes())
+        self.made.append(f"{process.host}/{process.name}")
+
+    def _given(self) -> Authority | None:
+        """A user's own CA."""
+        ca = self._security.ca
+        return None if ca is None else _authority_module().read_authority(Path(ca.certificate), Path(ca.key))
+
+    def _own(self) -> Authority:
+        """The CA of this deployment, made if it is not there yet."""
+        folder = private_directory(self._directory / CA_FOLDER)
+        files = folder / "ca.pem", folder / "ca.key"
+        if not all(file.exists() for file in files):
+            made = _authority_module().make_authority
+            certificate, key = made(f"zfusion {self._plan.run}", max(CA_DAYS, 2 * self._security.days))
+            write_private(files[1], key)
+            files[0].write_bytes(certificate)
+        read: Authority = _authority_module().read_authority(*files)
+        return read
+
+
+def _authority_module() -> Any:
+    """The module that makes certificates; InputError, naming the extra, where what it is made with is missing."""
+    try:
+        return import_module("zfusion.deploy.authority")
+    except ImportError as error:
+        raise InputError(f"making certificates needs {error.name}: pip install 'zfusion[deploy]'") from None

@@ -1,0 +1,334 @@
+"""Hosts files, plans and the folders that are made of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+import zenoh
+
+from deployed import deployed, hosts_document, planned, process
+from swarms import EXAMPLE, zfusion
+from zfusion import keys
+from zfusion.deploy.access import Speech, access_control
+from zfusion.deploy.folders import write
+from zfusion.deploy.hosts import HostsFile
+from zfusion.deploy.plan import Plan
+from zfusion.errors import InputError, ScenarioError
+from zfusion.model.scenario import load_scenario
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+
+
+def problems(tmp_path: Path, text: str) -> list[str]:
+    """What is wrong with a hosts file, without its name."""
+    path = tmp_path / "hosts.toml"
+    path.write_text(text)
+    with pytest.raises(ScenarioError) as caught:
+        HostsFile.load(path, load_scenario(EXAMPLE))
+    return [str(problem) for problem in caught.value.problems]
+
+
+def test_fields_are_checked(tmp_path: Path) -> None:
+    found = problems(
+        tmp_path,
+        """
+        topolgy = "direct"
+        run = "-x"
+        [hosts.a]
+        address = "999.1.1.1"
+        nodes = [1, "2"]
+        port = 70000
+        [security]
+        days = 0
+        """,
+    )
+    assert [line.split(":")[0] for line in found] == [
+        "run",
+        "hosts.a.address",
+        "hosts.a.nodes[1]",
+        "hosts.a.port",
+        "security.days",
+        "topolgy",
+    ]
+    assert "did you mean 'topology'?" in found[-1]
+
+
+def test_placement_roles_and_ports_are_checked(tmp_path: Path) -> None:
+    found = problems(
+        tmp_path,
+        """
+        [hosts.a]
+        address = "10.0.0.1"
+        nodes = [1, 2, 2, 9]
+        recorder = true
+        [hosts.b]
+        address = "10.0.0.1"
+        nodes = [3]
+        port = 7451
+        recorder = true
+        router = true
+        [hosts.ca]
+        address = "gateway.example.org"
+        [security]
+        enabled = false
+        certificates = "mine"
+        observer_reads = ["estimates"]
+        """,
+    )
+    assert [line.partition(" (is ")[0] for line in found] == [
+        "hosts.a.nodes[2]: expected each node once, this one is on a already",
+        "hosts.a.nodes[3]: expected a node of the scenario: 1, 2, 3, 4",
+        "hosts: expected node 4 on one of them",
+        "hosts.b.recorder: expected one recorder at most, a has one",
+        'hosts.b.router: expected no router where topology = "direct"',
+        "hosts.ca: expected a name of at most 51 letters, digits, '_' and '-', and not 'ca'",
+        "hosts.ca: expected something to run: nodes, recorder, observer or router",
+        "hosts.b.port: expected ports that a at the same address does not use",
+        "security.observer_reads[0]: expected one of measurement, intermediate, estimate, event, arrivals, revised, "
+        "truth, status, history",
+        "security.certificates: expected none where enabled = false",
+    ]
+    assert problems(tmp_path, 'topology = "router"\n[hosts.a]\naddress = "a"\nnodes = [1, 2, 3, 4]') == [
+        "topology: expected a host with router = true (is 'router')"
+    ]
+    assert problems(tmp_path, "hosts = 3")[0].startswith("hosts: expected a table")
+
+
+def test_the_larger_id_dials_and_readers_dial_all(tmp_path: Path) -> None:
+    scenario = load_scenario(EXAMPLE)
+    plan = Plan(scenario, HostsFile.load(DEPLOY / "hosts.example.toml", scenario), "field")
+    at = ["tls/10.0.0.1:7450", "tls/10.0.0.1:7451", "tls/10.0.0.2:7450", "tls/10.0.0.3:7450"]
+    for n, i in enumerate(scenario.ids):
+        node = process(plan, f"node-{i}")
+        assert (node.mode, node.listen, node.connect) == ("peer", (at[n],), tuple(at[:n]))
+    for name in ("recorder", "observer"):
+        assert (process(plan, name).listen, process(plan, name).connect) == ((), tuple(at))
+    assert plan.command(process(plan, "node-3")) == (
+        *("zfusion", "node", "scenario.toml", "--run", "field", "--zenoh-config", "zenoh/node-3.json5"),
+        *("--id", "3", "--await-recorder"),
+    )
+    assert {one.host for one in plan.on("gamma")} == {"gamma"}
+
+
+def test_clients_prefer_the_router_of_their_host(tmp_path: Path) -> None:
+    document = hosts_document("router")
+    document["hosts"]["b"] |= {"router": True, "bind": "0.0.0.0"}
+    plan = planned(tmp_path, document)
+    a, b = (f"tls/127.0.0.1:{document['hosts'][name]['port']}" for name in ("a", "b"))
+    assert process(plan, "node-1").connect == (a, b)
+    assert process(plan, "node-3").connect == (b, a)
+    assert process(plan, "node-4").connect == (a, b)
+    assert process(plan, "router-b").listen == (b.replace("127.0.0.1", "0.0.0.0"),)
+    assert (process(plan, "router-a").connect, process(plan, "router-b").connect) == ((), (a,))
+    assert process(plan, "node-1").mode == "client"
+
+
+def allowed(rules: dict[str, Any], name: str, flow: str, message: str) -> set[str]:
+    """The keys that the rules of one process let through in a message of another."""
+    [policy] = [policy for policy in rules["policies"] if policy["subjects"] == [name]] or [{"rules": []}]
+    return {
+        key
+        for rule in rules["rules"]
+        if rule["id"] in policy["rules"] and flow in rule["flows"] and message in rule["messages"]
+        for key in rule["key_exprs"]
+    }
+
+
+def test_rules_are_the_adjacency_matrix(tmp_path: Path) -> None:
+    plan = planned(tmp_path, hosts_document())
+    speech, run, graph = Speech(plan), plan.run, plan.scenario.network
+    for i in graph.ids:
+        rules = access_control(plan, process(plan, f"node-{i}"), speech)
+        assert rules["default_permission"] == "deny"
+        for j in set(graph.ids) - {i}:
+            heard = (
+                {keys.stage_key(run, j, s) for s in ("measurement", "intermediate")}
+                if j in graph.neighbours(i)
+                else set()
+            )
+            assert allowed(rules, f"node-{j}", "ingress", "put") == heard
+            assert allowed(rules, f"node-{j}", "egress", "declare_subscriber") == heard
+            asked = allowed(rules, f"node-{j}", "egress", "query")
+            assert asked == {keys.status_key(run, j)} | ({keys.history_key(run, j)} if heard else set())
+            assert allowed(rules, f"node-{j}", "ingress", "liveliness_token") == {keys.node_token(run, j)}
+        for silent in ("recorder", "observer"):
+            assert allowed(rules, silent, "ingress", "put") == set()
+        assert allowed(rules, "recorder", "ingress", "declare_subscriber") == {keys.whole_run(run)}
+        assert keys.stage_key(run, i, "measurement") not in allowed(rules, "observer", "egress", "put")
+        assert not {
+            key for rule in rules["rules"] for key in rule["key_exprs"] if not key.startswith(f"zfusion/{run}/")
+        }
+
+
+def test_rules_agree_between_the_ends_of_every_link(tmp_path: Path) -> None:
+    """What one lets out, the other lets in: through routers, too."""
+    for topology in ("direct", "router"):
+        plan = planned(tmp_path, hosts_document(topology))
+        speech = Speech(plan)
+        rules = {one.name: access_control(plan, one, speech) for one in plan.processes}
+        links = [("node-1", "node-2"), ("node-4", "recorder")] if topology == "direct" else [("node-1", "router-a")]
+        for (a, b), message in ((link, m) for link in links for m in ("put", "query", "reply", "liveliness_token")):
+            assert allowed(rules[a], b, "egress", message) == allowed(rules[b], a, "ingress", message)
+            assert allowed(rules[b], a, "egress", message) == allowed(rules[a], b, "ingress", message)
+
+
+def test_a_users_program_may_only_publish_its_sensors_readings(tmp_path: Path) -> None:
+    plan = planned(tmp_path, hosts_document(), source={"kind": "zenoh", "key": "plant/{id}/level"})
+    rules = access_control(plan, process(plan, "node-3"), Speech(plan))
+    assert allowed(rules, "sensor-3", "ingress", "put") == {"plant/3/level"}
+    assert allowed(rules, "sensor-4", "ingress", "put") == set()
+    assert process(plan, "sensor-3").connect == process(plan, "node-3").listen
+    assert plan.command(process(plan, "sensor-3")) == ()
+
+
+def modes(directory: Path) -> dict[str, int]:
+    return {str(path.relative_to(directory)): path.stat().st_mode & 0o777 for path in directory.rglob("*")}
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def test_folders_are_complete_and_can_be_written_again(tmp_path: Path) -> None:
+    plan = deployed(tmp_path, hosts_document())
+    out = tmp_path / "out"
+    found = modes(out)
+    for one in plan.processes:
+        assert found[f"{one.host}/{one.key}"] == 0o600
+        assert f"{one.host}/{one.certificate}" in found
+        assert zenoh.Config.from_file(str(out / one.host / one.zenoh_file)).get_json("mode") == json.dumps(one.mode)
+    assert {found[name] for name in ("a", "a/tls", "ca", "b/tls")} == {0o700}
+    assert found["ca/ca.key"] == 0o600
+    assert not [name for name in found if name.endswith("ca.key") and name != "ca/ca.key"]
+    assert load_scenario(out / "a" / "scenario.toml").fingerprint == plan.scenario.fingerprint
+    before = contents(out)
+    assert write(plan, out).certificates_made == []
+    assert contents(out) == before
+    renewed = write(plan, out, renew=True)
+    assert len(renewed.certificates_made) == 6
+    after = contents(out)
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed == {f"{one.host}/{name}" for one in plan.processes for name in (one.key, one.certificate)}
+
+
+def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("irreplaceable")
+    document = hosts_document()
+    with pytest.raises(InputError, match="expected an empty directory, or one that zfusion deploy has written"):
+        deployed(tmp_path, document)
+    (out / "thesis.tex").unlink()
+    deployed(tmp_path, document)
+    (out / "d").mkdir()
+    document["hosts"]["d"] = document["hosts"].pop("c") | {"observer": False}
+    with pytest.raises(InputError, match="expected nothing here: zfusion deploy has not written it"):
+        deployed(tmp_path, document)
+    (out / "d").rmdir()
+    plan = deployed(tmp_path, document)
+    assert write(plan, out).stale == ["c"]
+    with pytest.raises(InputError, match="this is the deployment of another run"):
+        write(Plan(plan.scenario, plan.hosts, "other"), out)
+
+
+def test_data_files_go_where_they_are_needed(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    for i in (1, 2, 3, 4):
+        (source / "readings" / str(i)).mkdir(parents=True)
+        (source / "readings" / str(i) / "y.csv").write_text(f"y\n{i}.5\n")
+    (source / "y.csv").write_text("y\n0.5\n")
+    (source / "trace.csv").write_text("0.001\n0.002\n")
+    document = tomllib.loads(EXAMPLE.read_text())
+    document["source"] = {"kind": "csv", "file": "readings/{id}/y.csv", "columns": ["y"]}
+    document["sensors"][3]["source"] = {"kind": "csv", "file": "y.csv", "columns": ["y"]}
+    document["links"] = {"delay": {"trace": "trace.csv"}}
+    document["recording"] = {"directory": "elsewhere", "compression": "lz4"}
+    (source / "s.toml").write_text(tomli_w.dumps(document))
+    plan = planned(tmp_path, hosts_document(), source / "s.toml")
+    write(plan, tmp_path / "out")
+    for host, data in {
+        "a": {"data/1/y.csv", "data/2/y.csv", "data/trace.csv"},
+        "b": {"data/3/y.csv", "data/trace.csv"},
+        "c": {"data/y.csv", "data/trace.csv"},
+    }.items():
+        folder = tmp_path / "out" / host
+        assert {name for name in contents(folder) if name.startswith("data/")} == data
+        loaded = load_scenario(folder / "scenario.toml")
+        assert loaded.fingerprint == plan.scenario.fingerprint
+        assert (loaded.recording.directory, loaded.recording.compression) == (None, "lz4")
+        for i in plan.hosts.hosts[host].nodes:
+            assert Path(loaded.source_of(i).file).exists()
+    (source / "trace.csv").unlink()
+    with pytest.raises(ScenarioError, match="expected a file that can be copied"):
+        write(plan, tmp_path / "again")
+
+
+def test_a_design_is_made_once_for_all(tmp_path: Path) -> None:
+    document = tomllib.loads((EXAMPLE.parent / "stationary.toml").read_text())
+    ids = [sensor["id"] for sensor in document["sensors"]]
+    hosts = {"run": "designed", "hosts": {"a": {"address": "127.0.0.1", "nodes": ids}}, "security": {"enabled": False}}
+    plan = planned(tmp_path, hosts, EXAMPLE.parent / "stationary.toml")
+    write(plan, tmp_path / "out")
+    before = contents(tmp_path / "out")
+    write(plan, tmp_path / "out")
+    assert contents(tmp_path / "out") == before
+    loaded = load_scenario(tmp_path / "out" / "a" / "scenario.toml")
+    assert loaded.method.design == "data/design.npz"
+    with np.load(tmp_path / "out" / "a" / "data" / "design.npz") as design:
+        assert design.files
+
+
+def test_own_certificates_are_checked_and_copied(tmp_path: Path) -> None:
+    plan = deployed(tmp_path, hosts_document())
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for path in (tmp_path / "out").rglob("tls/*"):
+        (mine / path.name).write_bytes(path.read_bytes())
+        (mine / path.name).chmod(0o600)
+    document = {"run": plan.run, **hosts_document(), "security": {"certificates": "mine"}}
+    second = planned(tmp_path, document)
+    write(second, tmp_path / "second")
+    assert not (tmp_path / "second" / "ca").exists()
+    assert (tmp_path / "second/a/tls/node-1.key").read_bytes() == (mine / "node-1.key").read_bytes()
+    (mine / "node-2.pem").write_bytes((mine / "node-1.pem").read_bytes())
+    (mine / "node-2.key").write_bytes((mine / "node-1.key").read_bytes())
+    with pytest.raises(InputError, match=r"node-2.pem: it is the certificate of 'node-1'"):
+        write(second, tmp_path / "third")
+    (mine / "node-2.key").unlink()
+    with pytest.raises(InputError, match=r"node-2.key: cannot be read"):
+        write(second, tmp_path / "third")
+    own = {"ca": {"certificate": "out/ca/ca.pem", "key": "out/ca/ca.key"}}
+    third = planned(tmp_path, {**hosts_document(), "security": own})
+    write(third, tmp_path / "fourth")
+    assert (tmp_path / "fourth/a/tls/ca.pem").read_bytes() == (mine / "ca.pem").read_bytes()
+
+
+def test_the_commands(tmp_path: Path) -> None:
+    words = ("deploy", EXAMPLE, "--hosts", DEPLOY / "hosts.example.toml", "-o", "out", "--json")
+    told = zfusion(tmp_path, *words).summary
+    assert told["folders"] == ["alpha", "beta", "gamma", "desk"]
+    assert len(told["certificates_made"]) == 6
+    readme = (tmp_path / "out" / "gamma" / "README").read_text()
+    assert "zfusion node scenario.toml --run field --zenoh-config zenoh/node-4.json5 --id 4 --await-recorder" in readme
+    refused = zfusion(
+        tmp_path, "node", "out/beta/scenario.toml", "--id", 3, "--zenoh-config", "out/beta/zenoh/node-3.json5"
+    )
+    assert refused.code == 2
+    assert "tls/ca.pem: cannot be read (No such file or directory)" in refused.error
+    beta = tmp_path / "out" / "beta"
+    impostor = zfusion(beta, "node", "scenario.toml", "--id", 4, "--zenoh-config", "zenoh/node-3.json5")
+    assert impostor.code == 2
+    assert "it is the certificate of 'node-3', and this process is 'node-4'" in impostor.error
+
+
+def test_without_the_extra_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zfusion.deploy.authority", None)
+    with pytest.raises(InputError, match=r"pip install 'zfusion\[deploy\]'"):
+        deployed(tmp_path, hosts_document())
