@@ -365,15 +365,15 @@ class Node:
     def _note_late(self, message: Message, stage: int) -> None:
         """Count what is late; if it is within the window, keep it until its stage closes again."""
         counters, step = self.counters[message.node], message.step
+        refusal = self._wary.refuses(stage, message.fields) if self._window and self._wary else None
+        if refusal is not None:
+            counters.refused[refusal] += 1
+            return
         counters.late[message.stage] += 1
         if not self._window or step < self.born or stage not in (0, len(self._stages) - 1):
             return
         if message.born != self._lives.get(message.node):
             return  # its sender's new life was heard before this could be used
-        refusal = self._wary.refuses(stage, message.fields) if self._wary else None
-        if refusal is not None:
-            counters.refused[refusal] += 1
-            return
         if step < self._closing(stage) - self._window:
             counters.too_late[message.stage] += 1
         else:
