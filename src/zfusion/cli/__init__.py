@@ -15,7 +15,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, deploy, experiment, library, live, models, recordings, report
+from zfusion.cli import compare, deploy, experiment, library, live, models, recordings, report, supervision
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -34,6 +34,7 @@ for command in (
     live.record,
     deploy.deploy,
     deploy.router,
+    supervision.health,
     models.design,
     compare.compare,
     compare.worst,

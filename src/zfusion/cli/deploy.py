@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from zfusion.cli.common import Json, ScenarioFile, finish, load, on_signals, out
+from zfusion.cli.supervision import supervised
 
 
 def deploy(
@@ -46,6 +47,8 @@ def router(
     """Run a Zenoh router, where there is no zenohd: the same configuration works with either. Ends with Ctrl-C."""
     from zfusion.drivers.router import Router
 
-    running = Router(zenoh_config)
-    on_signals(running.stop)
-    running.run()
+    with supervised() as supervisor:
+        running = Router(zenoh_config)
+        on_signals(running.stop)
+        supervisor.ready("routing")
+        running.run()
