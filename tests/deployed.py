@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import tomli_w
 import zenoh
 
+from namespaces import Hosts
 from swarms import Command, run_name, variant
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
@@ -57,11 +58,18 @@ def hosts_document(topology: str = "direct", **changes: Any) -> dict[str, Any]:
     return {"run": run_name("deployed"), "topology": topology, "hosts": hosts, **changes}
 
 
-def planned(directory: Path, document: Mapping[str, Any], scenario: Path | None = None, **changes: Any) -> Plan:
-    """The plan of a hosts file for a variant of the four-sensor example."""
+def planned(
+    directory: Path,
+    document: Mapping[str, Any],
+    scenario: Path | None = None,
+    *,
+    free_run: bool | None = None,
+    **changes: Any,
+) -> Plan:
+    """The plan of a hosts file for a scenario, by default a variant of the four-sensor example."""
     path = directory / "hosts.toml"
     path.write_text(tomli_w.dumps(document))
-    loaded = load_scenario(scenario or variant(directory, "field", **changes))
+    loaded = load_scenario(scenario or variant(directory, "field", **changes), free_run=free_run)
     return Plan(loaded, HostsFile.load(path, loaded), document["run"])
 
 
@@ -80,14 +88,14 @@ def process(plan: Plan, name: str) -> Process:
 class Swarm:
     """The processes of a deployed swarm, each started in its host's folder as its README says."""
 
-    def __init__(self, plan: Plan, out: Path, entrances: Mapping[str, Sequence[str]] | None = None) -> None:
-        """`entrances` has, by host, the words before a command that have it run there."""
+    def __init__(self, plan: Plan, out: Path, hosts: Hosts | None = None) -> None:
+        """`out` has the hosts' folders; `hosts` are those that they are on."""
         self.plan, self.out = plan, out
         self.commands: dict[str, Command] = {}
         for one in plan.processes:
             if one.kind in {"node", "recorder", "router"}:
                 words = [*plan.command(one)[1:], *(["--json"] if one.kind != "router" else [])]
-                entrance = () if entrances is None else entrances[one.host]
+                entrance = () if hosts is None else hosts.entrance(one.host)
                 self.commands[one.name] = Command(out / one.host, *words, entrance=entrance)
 
     def steps_taken(self) -> bool:
@@ -124,9 +132,9 @@ class Swarm:
 
 
 @contextmanager
-def swarm(plan: Plan, out: Path, entrances: Mapping[str, Sequence[str]] | None = None) -> Iterator[Swarm]:
+def swarm(plan: Plan, out: Path, hosts: Hosts | None = None) -> Iterator[Swarm]:
     """A deployed swarm that runs; routers are stopped, well, at the end."""
-    running = Swarm(plan, out, entrances)
+    running = Swarm(plan, out, hosts)
     try:
         yield running
         for name, command in running.commands.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,6 +34,9 @@ PATIENCE_S = 90.0
 POLL_S = 0.01
 
 ZFUSION = (sys.executable, "-m", "zfusion")
+
+MORTAL = ("setpriv", "--pdeathsig", "KILL", "--") if shutil.which("setpriv") else ()
+"""Words before a command that have it end with who started it: a test process that is killed leaves no swarm behind."""
 
 _numbers = count(1)
 
@@ -92,7 +96,7 @@ class Command:
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [*entrance, *ZFUSION, *map(str, words)],
+                [*MORTAL, *entrance, *ZFUSION, *map(str, words)],
                 cwd=directory,
                 stdout=out,
                 stderr=err,
@@ -103,6 +107,11 @@ class Command:
     def said(self) -> str:
         """What it has said on standard error so far."""
         return self._err.read_text()
+
+    @property
+    def heard(self) -> bool:
+        """Whether it has said anything on standard output."""
+        return self._out.stat().st_size > 0
 
     def interrupt(self) -> None:
         """Ctrl-C."""

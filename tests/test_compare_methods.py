@@ -20,17 +20,11 @@ from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.recording import Recording
 from zfusion.stages import Message
 from zfusion.studies import method_comparison
+from zfusion.studies.contestants import field_of, field_of_recording
 from zfusion.studies.experiment.plan import plan
 from zfusion.studies.experiment.spec import load_experiment
 from zfusion.studies.intervals import Interval
-from zfusion.studies.method_comparison import (
-    BELIEVED,
-    MethodComparison,
-    Standing,
-    compare_methods,
-    field_of,
-    field_of_recording,
-)
+from zfusion.studies.method_comparison import BELIEVED, MethodComparison, Standing, compare_methods
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 FIELD = EXAMPLES / "shootout_field.toml"

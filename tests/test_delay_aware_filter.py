@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from simulations import walk
+from zfusion.cli import app
 from zfusion.drivers.account import setting_of
 from zfusion.drivers.replayed import verify
 from zfusion.drivers.simulated import simulate
@@ -31,6 +34,7 @@ from zfusion.model.noise import CovarianceNoise
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.recording import Recording
+from zfusion.report.summary import notes_of
 from zfusion.stages import ESTIMATE, Message
 
 FOUR = Path(__file__).parents[1] / "examples" / "four_sensor.toml"
@@ -286,6 +290,47 @@ def test_probabilities_are_each_senders_own() -> None:
     np.testing.assert_array_equal(method._p[:, rows[10]], [[1.0], [0.0]])
     np.testing.assert_array_equal(method._p[:, rows[20]], [[0.5, 0.5], [0.2, 0.2]])
     np.testing.assert_array_equal(method._p[:, rows[50]], [[0.1], [0.0]])
+
+
+def test_a_state_that_grows_is_told_in_every_summary() -> None:
+    """Where something is random; with the sensors' gains known and time stamps there is nothing to tell."""
+    growing = STABLE | {"F": [[1.02, 0.2], [0.0, 0.6]]}
+    for options, told in (
+        ({"probabilities": [0.6, 0.2, 0.1]}, True),
+        ({}, True),
+        ({"probabilities": [1.0]}, False),
+        ({"companion": "stamped"}, False),
+    ):
+        given = Scenario.model_validate(
+            {**SURE, "system": growing, "method": {"name": "delay_aware", "options": options}}
+        )
+        warned = [note for note in notes_of(given) if "grows without bound" in note]
+        assert bool(warned) == told
+        assert all("spectral radius 1.0404, not below 1" in note for note in warned)
+        assert notes_of(varied(given, system=STABLE)) == [DELAY_AWARE.note]
+    random = scenario()  # of which the sensors' gains are random
+    assert len(notes_of(varied(random, system=growing))) == 2
+    assert len(notes_of(random)) == 1
+
+
+SURE: dict[str, Any] = {
+    "timing": REVISE,
+    "network": {"generator": "ring"},
+    "sensors": [{"ids": [1, 2, 3], "H": [[1.0, 0.5]], "R": 0.5}],
+}
+
+
+def test_what_its_predictions_take_for_granted_is_told(tmp_path: Path) -> None:
+    """Not that every message is there."""
+    given = Scenario.model_validate(
+        SURE
+        | {"system": STABLE, "links": LATE, "method": {"name": "delay_aware", "options": {"probabilities": [0.6, 0.3]}}}
+    )
+    (tmp_path / "s.toml").write_text(given.to_toml())
+    result = CliRunner().invoke(app, ["design", str(tmp_path / "s.toml"), "--method", "delay_aware", "--json"])
+    remarks = json.loads(result.stdout)["remarks"]
+    assert any("with delays and losses as the option probabilities says" in remark for remark in remarks)
+    assert not any("every message" in remark for remark in remarks)
 
 
 def test_errors_are_forecast() -> None:

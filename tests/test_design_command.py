@@ -6,6 +6,7 @@ import io
 import json
 import sys
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -195,7 +196,10 @@ def test_a_launch_designs_once_for_all_nodes(tmp_path: Path) -> None:
     given = load_scenario(logs / "scenario.toml")
     assert given.method.design == str(logs / "design.npz")
     assert stationary.Design.load(logs / "design.npz").ids == (1, 2, 3, 4, 5, 6)
-    verified = CliRunner().invoke(app, ["replay", str(tmp_path / "run.mcap"), "--verify", "--json"])
+    rmtree(logs)  # the recording has the design, too
+    (tmp_path / "elsewhere").mkdir()
+    recording = (tmp_path / "run.mcap").rename(tmp_path / "elsewhere" / "moved.mcap")
+    verified = CliRunner().invoke(app, ["replay", str(recording), "--verify", "--json"])
     assert (verified.exit_code, json.loads(verified.stdout)["different"]) == (0, 0)
 
 

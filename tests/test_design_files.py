@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from zfusion.errors import InputError
-from zfusion.methods.design_files import VERSION, DesignFileError, fingerprint, load, save
+from zfusion.methods.design_files import VERSION, DesignFileError, fingerprint, packed, read, unpack, write
 
 
 def written(path: Path, **change: Any) -> Path:
@@ -21,12 +21,12 @@ def written(path: Path, **change: Any) -> Path:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a design"  # the name stays as it is, without an ending that nobody asked for
-    save(path, "m", "f", {"K": np.eye(2), "ids": np.array(["a", "b"]), "J": np.array(1.5)})
-    arrays = load(path, "m", "f")
+    write(path, packed("m", "f", {"K": np.eye(2), "ids": np.array(["a", "b"]), "J": np.array(1.5)}))
+    arrays = unpack(read(path), "m", "f")
     assert sorted(arrays) == ["J", "K", "ids"]
     np.testing.assert_array_equal(arrays["K"], np.eye(2))
     assert arrays["ids"].tolist() == ["a", "b"]
-    assert load(path, "m").keys() == arrays.keys()
+    assert unpack(read(path), "m").keys() == arrays.keys()
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 )
 def test_foreign_files_are_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     with pytest.raises(DesignFileError, match=words):
-        load(written(tmp_path / "d.npz", **change), "m", "f")
+        unpack(read(written(tmp_path / "d.npz", **change)), "m", "f")
 
 
 def test_files_that_are_no_archives_are_refused(tmp_path: Path) -> None:
@@ -53,16 +53,16 @@ def test_files_that_are_no_archives_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "headless.npz", K=np.eye(2))
     for name in ("text", "array.npy", "cut", "empty", "pickled.npz", "headless.npz"):
         with pytest.raises(DesignFileError, match="not a design file"):
-            load(tmp_path / name, "m")
+            unpack(read(tmp_path / name), "m")
     with pytest.raises(DesignFileError, match="there is no such file"):
-        load(tmp_path / "nothing.npz", "m")
+        read(tmp_path / "nothing.npz")
 
 
 def test_what_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
-        save(tmp_path / "no" / "such" / "directory.npz", "m", "f", {})
+        write(tmp_path / "no" / "such" / "directory.npz", packed("m", "f", {}))
     with pytest.raises(ValueError, match="taken"):
-        save(tmp_path / "d.npz", "m", "f", {"method": np.array(1)})
+        packed("m", "f", {"method": np.array(1)})
 
 
 def test_fingerprints_see_numbers_and_not_rounding() -> None:

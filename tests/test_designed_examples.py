@@ -17,7 +17,7 @@ from simulations import losing, record
 from zfusion.cli import app
 from zfusion.drivers.designs import design_of, modes_of
 from zfusion.drivers.replayed import verify
-from zfusion.drivers.simulated import Simulation
+from zfusion.drivers.simulated import Simulation, simulate
 from zfusion.errors import InputError, ZfusionError
 from zfusion.links import Topology
 from zfusion.methods.design_files import DesignFileError
@@ -42,8 +42,8 @@ def simulated(scenario: Scenario) -> tuple[Simulation, dict[tuple[str, Any, int]
 
 @pytest.mark.parametrize("name", BOTH)
 def test_errors_of_the_examples_are_as_large_as_predicted(name: str) -> None:
-    """Of independent runs, from the first step on: eᵀP⁻¹e is nx and |e|² is tr P in the mean, within 6 sigma of it."""
-    base, runs = example(name, steps=12), 60
+    """Of independent runs, from the first step on: eᵀP⁻¹e is nx and |e|² is tr P in the mean, within 4.5 sigma."""
+    base, runs = example(name, steps=12), 34
     nees, excess = np.zeros(runs), np.zeros(runs)
     for seed in range(runs):
         simulation, _ = simulated(base.with_overrides(seed=seed))
@@ -52,8 +52,8 @@ def test_errors_of_the_examples_are_as_large_as_predicted(name: str) -> None:
         excess[seed] = np.mean([errors["mse"] / errors["predicted_mse"] - 1 for errors in of_nodes])
     for sample, expected in ((nees, base.system().nx), (excess, 0.0)):
         sigma = sample.std(ddof=1) / np.sqrt(runs)
-        assert abs(sample.mean() - expected) < 6 * sigma
-        assert sigma < 0.15  # which says something
+        assert abs(sample.mean() - expected) < 4.5 * sigma
+        assert sigma < 0.2  # which says something
 
 
 def test_a_long_run_predicts_the_designs_errors() -> None:
@@ -101,6 +101,21 @@ def test_all_nodes_draw_the_same_modes_in_whatever_order() -> None:
     one = Topology(load_scenario(EXAMPLES / "l2_linf.toml"))
     assert [one.mode(k) for k in range(79, 0, -1)][::-1] == forwards
     assert [Topology(scenario.with_overrides(seed=1)).mode(k) for k in range(1, 80)] != forwards
+
+
+@pytest.mark.parametrize("timing", [{"rate_hz": 10.0, "late": "wait"}, {"free_run": True}])
+def test_nobody_waits_for_neighbours_that_the_mode_does_not_have(timing: dict[str, Any], tmp_path: Path) -> None:
+    """Not for one timeout; and a replay, which goes by what was used, finds the same."""
+    scenario = example("l2_linf", steps=25, timing=timing | {"timeout_s": 5.0})
+    path = tmp_path / "run.mcap"
+    reports = simulate(scenario, run="r", output=path)
+    for [life] in reports.values():
+        assert life.completed == 25
+        assert life.elapsed_s < 5.0
+        assert all(not edge["missed"] for edge in life.edges.values())
+    assert {Topology(scenario).mode(k) for k in range(1, 26)} == {0, 1}
+    with Recording.open(path) as recording:
+        assert verify(recording).identical == 2 * 25 * 4
 
 
 KILLS = [{"kind": "kill", "node": 2, "step": 10, "restart_after": 5}, {"kind": "kill", "node": 4, "step": 20}]

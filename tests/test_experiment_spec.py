@@ -134,6 +134,17 @@ def test_a_file_that_a_scenario_reads_is_part_of_the_hash(tmp_path: Path) -> Non
     assert planned(tmp_path, text).points[0].seeds[0].hash != before
 
 
+def test_a_design_file_is_part_of_the_hash_of_runs_only(tmp_path: Path) -> None:
+    """What is predicted of a scenario is for the two-stage filter, whatever method the runs are of."""
+    text = HEAD + 'set = { method = { name = "stationary", design = "d.npz" } }\n'
+    (tmp_path / "d.npz").write_bytes(b"a design")
+    [before] = planned(tmp_path, text).points
+    (tmp_path / "d.npz").write_bytes(b"another one")
+    [after] = planned(tmp_path, text).points
+    assert not {task.hash for task in before.seeds} & {task.hash for task in after.seeds}
+    assert before.theory.hash == after.theory.hash
+
+
 @pytest.mark.parametrize(
     ("text", "field", "expected"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -40,23 +41,30 @@ ONLY = {
     "typer": ("cli.py", "cli/"),
     "cryptography": ("deploy/authority.py",),
     "pydantic": ("deploy/hosts.py", "model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
+    "prometheus_client": ("report/exporters.py",),
+    "opentelemetry": ("report/exporters.py",),
     "distributed": ("studies/experiment/engines.py",),
     "cvxpy": ("methods/convex.py",),
     "scipy": ("methods/convex.py",),
 }
 """Packages, and the only places that import them."""
 
-ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player"}
+ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player", "observer"}
 
 NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py", "links/")
 
 
-def modules() -> Iterator[tuple[str, ast.Module]]:
-    for path in sorted(SOURCE.rglob("*.py")):
-        yield path.relative_to(SOURCE).as_posix(), ast.parse(path.read_text())
+@cache
+def modules() -> list[tuple[str, ast.Module]]:
+    return [(path.relative_to(SOURCE).as_posix(), ast.parse(path.read_text())) for path in sorted(SOURCE.rglob("*.py"))]
 
 
-def imported(tree: ast.Module) -> Iterator[str]:
+@cache
+def imported(tree: ast.Module) -> list[str]:
+    return list(names_of(tree))
+
+
+def names_of(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

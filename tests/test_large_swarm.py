@@ -29,7 +29,7 @@ SCENARIO = {
 @pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_thirty_two_nodes_run_without_drama(tmp_path: Path) -> None:
-    path, steps = tmp_path / "ring.toml", 40
+    path, steps = tmp_path / "ring.toml", 20
     path.write_text(tomli_w.dumps(SCENARIO))
     began = time.time_ns()
     result = launch(tmp_path, path, "--steps", steps, "--record", "ring.mcap", run=run_name("ring"))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -133,10 +135,11 @@ def test_the_recording_says_how_it_was_stopped(summary: dict[str, Any]) -> None:
 
 def test_the_same_seed_gives_the_same_estimates_whatever_the_pace(summary: dict[str, Any], directory: Path) -> None:
     paced = launch(directory, EXAMPLE, "--rate", 20, "--steps", 40, "--record", "paced.mcap").summary
-    assert paced["completed_steps"] == dict.fromkeys(NODES, 40)
-    assert paced["rounds_per_s"] == pytest.approx(20, rel=0.05)
-    assert (paced["lost"], paced["skipped"]) == (0, 0)
-    if paced["missed"] == 0:  # the machine was not too busy for the deadlines
+    assert set(paced["completed_steps"]) == set(NODES)
+    assert sum(paced["completed_steps"].values()) + paced["skipped"] == 4 * 40
+    assert 10 < paced["rounds_per_s"] < 1.05 * 20
+    assert paced["lost"] == 0
+    if paced["missed"] == paced["skipped"] == 0:  # the machine was not too busy for the deadlines
         free = estimates(directory / "free.mcap")
         assert all(free[place] == estimate for place, estimate in estimates(directory / "paced.mcap").items())
 
@@ -189,3 +192,26 @@ def test_ids_may_be_names(directory: Path) -> None:
     summary = launch(directory, path, "--free-run", "--steps", 20, "--record", "named.mcap").summary
     assert summary["completed_steps"] == dict.fromkeys(("ada", "bob", "cyd", "dan"), 20)
     assert summary["lost"] == 0
+
+
+CROWD = """
+import os, sys
+os.getpid = lambda: 4711  # as if they began at the same place
+from zfusion.swarm.launch import free_endpoints
+print(*(endpoint for _ in range(10) for endpoint in free_endpoints(15)), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_launchers_that_look_for_free_ports_at_the_same_time_find_different_ones() -> None:
+    crowd = [
+        subprocess.Popen([sys.executable, "-c", CROWD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    try:
+        found = [process.stdout.readline().split() for process in crowd if process.stdout is not None]
+    finally:
+        for process in crowd:
+            process.communicate(timeout=60)
+    assert [len(set(endpoints)) for endpoints in found] == [150, 150]
+    assert not {*found[0]} & {*found[1]}

@@ -111,7 +111,7 @@ def check(swarm: Swarm) -> Counter[str]:
     return seen
 
 
-@settings(slow, max_examples=25)
+@settings(slow, max_examples=15)
 @given(
     st.integers(0, 10**6),
     weathers,
@@ -130,7 +130,7 @@ def test_whatever_the_network_does_the_estimates_are_right(
         check(swarm)
 
 
-@settings(slow, max_examples=25)
+@settings(slow, max_examples=15)
 @given(
     st.integers(0, 10**6),
     climates,
@@ -335,7 +335,7 @@ def test_an_answer_says_only_what_is_final() -> None:
 
 # --- are errors as large as they are said to be?
 
-RUNS, SIGMAS = 24, 6.0
+RUNS, SIGMAS = 12, 4.5
 
 
 def rough(seed: int) -> Link:
@@ -355,7 +355,7 @@ def rough(seed: int) -> Link:
 def test_errors_are_as_large_as_predicted_whatever_becomes_of_what_is_late(timing: dict[str, object]) -> None:
     """NEES, with losses, lateness and a restart. What is published when depends on no data, so its mean is nx = 2.
 
-    A run's mean over its nodes and steps is one sample; the mean over runs may be off by 6 of its standard deviations.
+    A run's mean over its nodes and steps is one sample; their mean may be off by 4.5 of its standard deviations.
     """
     nees: dict[str, list[float]] = {}
     for seed in range(RUNS):
@@ -375,7 +375,7 @@ def test_errors_are_as_large_as_predicted_whatever_becomes_of_what_is_late(timin
     assert set(nees) == ({"estimate", "revised"} if timing["late"] == "revise" else {"estimate"})
     for samples in nees.values():
         deviation = np.std(samples, ddof=1) / np.sqrt(len(samples))
-        assert deviation < 0.2
+        assert deviation < 0.25
         assert abs(np.mean(samples) - 2.0) < SIGMAS * deviation
 
 

@@ -138,6 +138,14 @@ def misbehave_as_readers(doors: Doors, run: str) -> None:
         wait_until(everything.collect, "the recorder reads")
 
 
+def observer_sees_who_is_there(plan: Plan, running: Swarm) -> None:
+    """With the rules of its own configuration in force, too."""
+    one = process(plan, "observer")
+    words = ("scenario.toml", "--run", plan.run, "--zenoh-config", one.zenoh_file)
+    look = zfusion(running.out / one.host, "status", *words, "--json")
+    assert look.code == 0, look.err
+
+
 def recording_is_honest(directory: Path, plan: Plan, running: Swarm, forged: list[str]) -> None:
     """Nothing on it is anybody's but its key's owner's, and every estimate follows from it."""
     messages = recorded(running.recording)
@@ -169,6 +177,7 @@ def test_nobody_uninvited(tmp_path: Path, topology: str) -> None:
         try_the_doors(tmp_path, doors, running)
         misbehave_as_node_1(doors, plan.run)
         misbehave_as_readers(doors, plan.run)
+        observer_sees_who_is_there(plan, running)
         running.interrupt()
         reports = running.ended()
     refused = {

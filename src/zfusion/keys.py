@@ -99,6 +99,21 @@ def whole_run(run: str) -> str:
     return f"{ROOT}/{run}/**"
 
 
+def expression(run: str, text: str) -> str:
+    """The key expression that a person means: ``estimate`` (of all), ``1/estimate``, ``node/1/estimate``, ``truth``.
+
+    What begins with ``zfusion/`` is one already; ``/`` before it says so of any other.
+    """
+    if text.startswith("/"):
+        return text[1:]
+    first, *more = text.split("/")
+    if first == ROOT and more:
+        return text
+    if first in {"node", "recorder", TRUTH.name, "**"}:
+        return f"{ROOT}/{run}/{text}"
+    return f"{ROOT}/{run}/node/{text}" if more else stage_key(run, "*", text)
+
+
 def parse(key: str) -> Key:
     """What a message's key says; MessageError if it is not one of zfusion's."""
     if match := _STAGE.fullmatch(key):

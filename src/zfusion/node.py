@@ -28,7 +28,7 @@ from itertools import pairwise
 from typing import cast
 
 from zfusion.gaps import GapCounter
-from zfusion.methods.protocol import Fields, Method, Outcome, Revising, Wary
+from zfusion.methods.protocol import Fields, Method, Outcome, Revising, Selective, Wary
 from zfusion.model.types import Array, NodeId, sorted_ids
 from zfusion.stages import ESTIMATE, EVENT, REVISED, Message
 from zfusion.used_sets import HISTORY_RUNS, Ledger, Run, UsedSet
@@ -145,6 +145,7 @@ class Node:
         """Of the last completed step."""
         self._method = method
         self._wary = method if isinstance(method, Wary) else None
+        self._selective = method if isinstance(method, Selective) else None
         self._stages = [stage.name for stage in method.stages]
         self._number = {name: number for number, name in enumerate(self._stages)}
         self._patience = patience
@@ -333,7 +334,8 @@ class Node:
         self._stage = stage
         effects.append(self._message(self._stages[stage], fields, now))
         self._arrived = {self.id: fields}
-        self._missing = {j for j, since in self._expected.items() if since <= self.step}
+        unheard = self._selective.unheard(self.step) if self._selective else ()
+        self._missing = {j for j, since in self._expected.items() if since <= self.step and j not in unheard}
         self.deadline = self._patience.waits_ns[stage] + (self._start if self._patience.paced else now)
         for message in self._early.pop((self.step, stage), {}).values():
             self._accept(message)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from importlib.metadata import version
+from math import isfinite
 from typing import Any
 
 from zfusion.errors import MessageError
 from zfusion.messages import VERSION, Reason, decode_any, encode_any
 from zfusion.model.types import NodeId
 from zfusion.used_sets import Run
+
+BIN = re.compile(r"[0-9]{1,4}")
+"""The number of a histogram's bin, as text."""
 
 
 class Phase(StrEnum):
@@ -22,6 +27,51 @@ class Phase(StrEnum):
     RUNNING = "running"
     DONE = "done"
     """Has taken its last step and stays until its neighbours have its last messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What a node has counted so far in its present life; told to those who ask for it."""
+
+    host: str
+    skipped: int
+    elapsed_s: float
+    """From the start of its first step to the end of its last."""
+    cpu_s: float
+    """Of its process, since that was started."""
+    sent: Mapping[str, int]
+    """By stage."""
+    edges: Mapping[str, Mapping[str, Mapping[str, int]]]
+    """Neighbour -> received, late, missed, lost, refused, ... -> by stage or reason."""
+    overheard: Mapping[str, int]
+    """What was not a legal message, and other trouble, by reason."""
+    incidents: Mapping[str, int]
+    waits: Mapping[str, Mapping[str, int]]
+    """Stage -> how long it was open, as `Latencies.told`."""
+    clocks: Mapping[str, Mapping[str, float]]
+    """Neighbour -> offset_us, uncertainty_us: how far its clock is ahead of this node's, where that is known."""
+    queues: Mapping[str, int]
+
+    def total(self, kind: str) -> int:
+        """Over all neighbours and stages."""
+        return sum(sum(edge.get(kind, {}).values()) for edge in self.edges.values())
+
+    @classmethod
+    def from_map(cls, raw: Mapping[str, Any]) -> Counts:
+        """From a map; KeyError or MessageError if it is not such a one."""
+        return cls(
+            host=_typed(raw, "host", str),
+            skipped=_typed(raw, "skipped", int),
+            elapsed_s=_typed(raw, "elapsed_s", float),
+            cpu_s=_typed(raw, "cpu_s", float),
+            sent=_numbers(raw, "sent", int),
+            edges={j: {kind: _numbers(edge, kind, int) for kind in edge} for j, edge in _maps(raw, "edges").items()},
+            overheard=_numbers(raw, "overheard", int),
+            incidents=_numbers(raw, "incidents", int),
+            waits={stage: _bins(waits) for stage, waits in _maps(raw, "waits").items()},
+            clocks={j: _all(clock, float) for j, clock in _maps(raw, "clocks").items()},
+            queues=_numbers(raw, "queues", int),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +97,8 @@ class Status:
     heard_ns: int = 0
     """When the question was heard that this answers, and when the answer was told, on the node's clock."""
     told_ns: int = 0
+    counts: Counts | None = None
+    """Where they were asked for."""
     zfusion: str = version("zfusion")
     wire: int = VERSION
 
@@ -74,9 +126,11 @@ class Status:
                 ready={_id(i): int(start) for i, start in _typed(raw, "ready", list)},
                 completed=_typed(raw, "completed", int),
                 fallbacks=_typed(raw, "fallbacks", int),
+                estimate=_vectors(raw, "estimate"),
                 machine=None if raw["machine"] is None else _typed(raw, "machine", str),
                 heard_ns=_typed(raw, "heard_ns", int),
                 told_ns=_typed(raw, "told_ns", int),
+                counts=Counts.from_map(raw["counts"]) if raw.get("counts") is not None else None,
                 zfusion=_typed(raw, "zfusion", str),
                 wire=_typed(raw, "wire", int),
             )
@@ -85,6 +139,36 @@ class Status:
         except (TypeError, ValueError) as error:
             raise MessageError(Reason.WRONG_TYPE, str(error)) from None
         return status
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """How the recorder is doing."""
+
+    messages: int
+    """On the file."""
+    foreign: int
+    """What came and is not on the file: on keys that are none of the scenario's, or larger than any message is."""
+    lost: int
+    """Missing between the first and the last that came of every key."""
+    waiting: int
+    """Messages that had come and were not on the file yet when the question was heard."""
+    path: str
+    host: str
+
+    def encode(self) -> bytes:
+        """As bytes."""
+        return encode_any(asdict(self))
+
+    @classmethod
+    def decode(cls, data: bytes) -> RecorderStatus:
+        """From bytes; MessageError if they are no such status."""
+        raw = decode_any(data)
+        try:
+            counts = {name: _typed(raw, name, int) for name in ("messages", "foreign", "lost", "waiting")}
+            return cls(**counts, path=_typed(raw, "path", str), host=_typed(raw, "host", str))
+        except KeyError as missing:
+            raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,4 +220,39 @@ def _typed(raw: Mapping[str, Any], name: str, expected: type) -> Any:
     value = raw[name]
     if type(value) is not expected:
         raise MessageError(Reason.WRONG_TYPE, f"{name}: expected {expected.__name__}, is {value!r:.80}")
+    if isinstance(value, float) and not isfinite(value):
+        raise MessageError(Reason.NOT_FINITE, f"{name}: {value}")
     return value
+
+
+def _maps(raw: Mapping[str, Any], name: str) -> Mapping[str, Mapping[str, Any]]:
+    """A map of maps."""
+    maps: Mapping[str, Mapping[str, Any]] = _typed(raw, name, dict)
+    return {key: _typed(maps, key, dict) for key in maps}
+
+
+def _numbers(raw: Mapping[str, Any], name: str, kind: type) -> Mapping[str, Any]:
+    """A map of numbers that are all of that kind."""
+    return _all(_typed(raw, name, dict), kind)
+
+
+def _all(numbers: Mapping[str, Any], kind: type) -> Mapping[str, Any]:
+    return {key: _typed(numbers, key, kind) for key in numbers}
+
+
+def _bins(raw: Mapping[str, Any]) -> Mapping[str, int]:
+    """A histogram: counts by the numbers of their bins."""
+    if not all(BIN.fullmatch(number) for number in raw):
+        raise MessageError(Reason.WRONG_TYPE, "waits: expected the numbers of bins")
+    return _all(raw, int)
+
+
+def _vectors(raw: Mapping[str, Any], name: str) -> Mapping[str, list[float]]:
+    """A map of lists of floats; empty where there is none."""
+    vectors: Mapping[str, Any] = _typed({name: raw.get(name, {})}, name, dict)
+    for key in vectors:
+        if not {float}.issuperset(map(type, _typed(vectors, key, list))):
+            raise MessageError(Reason.WRONG_TYPE, f"{name}: {key}: expected nothing but floats")
+        if not all(map(isfinite, vectors[key])):
+            raise MessageError(Reason.NOT_FINITE, f"{name}: {key}")
+    return vectors

@@ -6,16 +6,26 @@ object on standard output, everything else on standard error.
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import Annotated
 
 import typer
-from rich.logging import RichHandler
 from rich.markup import escape
 
 from zfusion import __version__
-from zfusion.cli import compare, deploy, experiment, library, live, models, recordings, report, supervision
+from zfusion.cli import (
+    compare,
+    deploy,
+    experiment,
+    library,
+    live,
+    logs,
+    models,
+    observe,
+    recordings,
+    report,
+    supervision,
+)
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
 
@@ -35,6 +45,11 @@ for command in (
     deploy.deploy,
     deploy.router,
     supervision.health,
+    observe.status,
+    observe.top,
+    observe.echo,
+    observe.hz,
+    observe.metrics,
     models.design,
     compare.compare,
     compare.worst,
@@ -54,20 +69,22 @@ def run() -> None:
     try:
         app()
     except ZfusionError as error:
-        err.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
+        if logs.as_json():
+            logs.log.error("%s", error)
+        else:
+            err.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(error.exit_code)
 
 
 @app.callback()
 def _options(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell more.")] = False,
+    log_format: Annotated[
+        logs.LogFormat, typer.Option(envvar=logs.VARIABLE, help="How logs are written.", show_envvar=True)
+    ] = logs.LogFormat.TEXT,
     version: Annotated[bool, typer.Option("--version", help="Show the version and exit.", is_eager=True)] = False,
 ) -> None:
     if version:
         out.print(f"zfusion {__version__}")
         raise typer.Exit
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(message)s",
-        handlers=[RichHandler(console=err, show_path=False, markup=False)],
-    )
+    logs.configure(log_format, err, verbose=verbose)

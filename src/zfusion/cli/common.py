@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from zfusion.cli import logs
 from zfusion.errors import InputError, ZfusionError
 from zfusion.keys import check_run
 from zfusion.methods.check import check_method
@@ -85,7 +86,11 @@ def load(
     check_method(loaded, str(path))
     links_of(loaded)
     for n in Timeline(loaded).beyond(loaded.steps):
-        err.print(f"faults[{n}] begins after the last step, {loaded.steps}: it will not happen")
+        said = f"faults[{n}] begins after the last step, {loaded.steps}: it will not happen"
+        if logs.as_json():
+            logs.log.warning(said)
+        else:
+            err.print(said)
     return loaded
 
 

@@ -86,7 +86,8 @@ def _methods(
 ) -> None:
     from zfusion.report.extras import check_extras
     from zfusion.report.method_comparison import save_figures, show_methods
-    from zfusion.studies.method_comparison import compare_methods, field_of, field_of_recording
+    from zfusion.studies.contestants import field_of, field_of_recording
+    from zfusion.studies.method_comparison import compare_methods
 
     if output is not None:
         check_extras()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from zfusion.cli import logs
 from zfusion.cli.common import (
     Connect,
     ControlFd,
@@ -42,6 +45,7 @@ from zfusion.cli.progress import design_first
 from zfusion.cli.supervision import supervised, teller
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
+from zfusion.model.types import NodeId
 
 NetnsKind = Literal["tun", "netem"]
 
@@ -96,10 +100,11 @@ def launched(
     from zfusion.swarm.launch import Launcher, LaunchOptions
 
     directory = recording.parent if recording is not None else default_directory(scenario)
-    logs = directory / f"{run}.logs"
+    logs.about(run)
     design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
-        options = LaunchOptions(run, logs, recording, restart, netns, table.update, table.message)
+        say = logs.log.warning if logs.as_json() else table.message
+        options = LaunchOptions(run, directory / f"{run}.logs", recording, restart, netns, table.update, say)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -195,11 +200,14 @@ def node(
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
             control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
 
+        logs.about(options.run, own)
         live = LiveNode(loaded, own, options, tell, None if control is None else announce)
+        logs.about(options.run, own, lambda: None if live.node is None else live.node.step)
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
-        report = asdict(live.run())
+        with noted(control, loaded, options.run, options.endpoints.listen, own):
+            report = asdict(live.run())
     if control is not None:
         control.tell(report=report)
         return
@@ -221,6 +229,7 @@ def record(
     control_fd: ControlFd = None,
 ) -> None:
     """Record a run: the recorder alone, for swarms on many machines. Ends with Ctrl-C, or when all nodes have left."""
+    from zfusion.drivers.designs import content_of
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
@@ -231,6 +240,7 @@ def record(
         as_written = load_scenario(scenario)
         loaded = as_written.with_overrides(zenoh_config=zenoh_config)
         name = given_run(run, loaded)
+        logs.about(name)
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
@@ -240,20 +250,45 @@ def record(
             method=method,
             seed=loaded.seed,
             stages=chosen(loaded).stages,
+            design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
         )
         tell = teller(control, supervisor, supervisor.recorder)
-        recorder = Recorder(
-            loaded, name, recorder_endpoints(loaded, connect, listen), writer, until_all_gone=control is None, tell=tell
-        )
+        endpoints = recorder_endpoints(loaded, connect, listen)
+        recorder = Recorder(loaded, name, endpoints, writer, until_all_gone=control is None, tell=tell)
         on_signals(recorder.stop)
         if control is not None:
             control.on_stop(recorder.stop)
-        report = asdict(recorder.run())
+        with noted(control, loaded, name, endpoints.listen):
+            report = asdict(recorder.run())
     if control is not None:
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+
+
+def noted(
+    control: Any, scenario: Scenario, run: str, listens: Sequence[str], node: NodeId | None = None
+) -> AbstractContextManager[None]:
+    """Have observers on this machine find a process that was started by hand: a node, or the recorder."""
+    from zfusion.drivers.endpoints import listens_at
+    from zfusion.drivers.registry import Entry, registered
+
+    if control is not None:  # the launcher does it for all
+        return nullcontext()
+    transport = scenario.transport
+    own = transport.zenoh_config if not listens else None
+    own_endpoint = {str(node): listens[0]} if node is not None and listens else {}
+    entry = Entry(
+        run=run,
+        scenario=scenario.name,
+        endpoints=own_endpoint,
+        elsewhere={} if own else {str(i): endpoint for i, endpoint in listens_at(scenario).items()},
+        recorder=listens[0] if node is None and listens else None,
+        low_latency=transport.preset == "lowlatency",
+        config=str(scenario.absolute(own)) if own else None,
+    )
+    return registered(entry)
 
 
 def network(

@@ -16,6 +16,7 @@ from zfusion.errors import InputError
 from zfusion.methods import METHODS, chosen
 
 if TYPE_CHECKING:
+    from zfusion.methods.family import Forecast
     from zfusion.model.scenario import Scenario
     from zfusion.report.forecast import Foretold
 
@@ -85,7 +86,7 @@ def _designed(scenario: Scenario, output: Path | None) -> Foretold:
     seconds = time.perf_counter() - began
     if output is not None:
         made.save(output)
-    remarks = _unforeseen(scenario)
+    remarks = _unforeseen(scenario, made.forecast)
     return Foretold(scenario.name, scenario.method.name, scenario.ids, made.forecast, remarks, seconds, output)
 
 
@@ -99,7 +100,7 @@ def _forecast(scenario: Scenario) -> Foretold:
             known = method.family.forecast(method.options, scenario.system(), method.network(scenario.network))
         except InputError as error:
             return _bounds_only(scenario, f"no prediction: {error}")
-        return Foretold(scenario.name, method.name, scenario.ids, known, _unforeseen(scenario))
+        return Foretold(scenario.name, method.name, scenario.ids, known, _unforeseen(scenario, known))
     return _bounds_only(
         scenario,
         f"no prediction: nothing tells the errors of {method.name} beforehand; "
@@ -119,10 +120,10 @@ def _bounds_only(scenario: Scenario, why: str) -> Foretold:
     return Foretold(scenario.name, scenario.method.name, scenario.ids, bounds, (why, at))
 
 
-def _unforeseen(scenario: Scenario) -> tuple[str, ...]:
+def _unforeseen(scenario: Scenario, forecast: Forecast) -> tuple[str, ...]:
     if not _links_matter(scenario):
         return ()
-    return ("with every message there: what the links and faults of the scenario do is for zfusion compare to tell",)
+    return (f"{forecast.given}: what the links and faults of the scenario do is for zfusion compare to tell",)
 
 
 def _links_matter(scenario: Scenario) -> bool:

@@ -129,16 +129,19 @@ def _other(
     recording: Recording, scenario: Path | None, links: str | None, overrides: Overrides, settings: Mapping[str, Any]
 ) -> Scenario:
     """What the measurements are to be run through: the recorded scenario or another one, changed as is said."""
+    from zfusion.drivers.designs import handed_on
     from zfusion.drivers.replayed import recorded_scenario
     from zfusion.drivers.rerun import with_recorded_links
     from zfusion.studies.settings import with_settings
 
     other: Scenario = load(scenario) if scenario is not None else recorded_scenario(recording)
+    begun = other
     if links == RECORDED:
         other = with_recorded_links(other, recording)
     elif links is not None:
         overrides["links"] = links
     other = with_settings(other.with_overrides(**overrides), settings, str(scenario or recording.path))
+    other = handed_on(begun, other)
     check_method(other, str(scenario or recording.path))
     return other
 

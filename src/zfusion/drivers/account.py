@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import cast
 
@@ -19,6 +21,7 @@ from zfusion.model.scenario import Scenario
 from zfusion.model.types import Array, NodeId
 from zfusion.node import Node, Patience
 from zfusion.stages import ARRIVALS, ESTIMATE, INTERMEDIATE, REVISED, TRUTH, TRUTH_SENDER, Message
+from zfusion.status import Counts
 
 COMPARED = (INTERMEDIATE.name, ESTIMATE.name, REVISED.name)
 """Stages whose x is an estimate of the state at their step."""
@@ -136,7 +139,7 @@ class Account:
             step=node.step,
             completed=node.completed,
             skipped=self.skipped,
-            elapsed_s=(max(pace.ended_ns for pace in self._paces) - self._begun_ns) / 1e9,
+            elapsed_s=self.elapsed_s,
             sent=dict(node.sent),
             edges=edge_report(node),
             fallbacks=node.fallbacks,
@@ -147,6 +150,28 @@ class Account:
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},
             measured=self.meter.told(),
             incidents=dict(node.incidents),
+        )
+
+    @property
+    def elapsed_s(self) -> float:
+        """From the start of its first step to the end of its last."""
+        return (max(pace.ended_ns for pace in self._paces) - self._begun_ns) / 1e9
+
+    def counts(self) -> Counts:
+        """What was counted so far, for those who look on; cheap."""
+        node = self._node
+        return Counts(
+            host=platform.node(),
+            skipped=self.skipped,
+            elapsed_s=self.elapsed_s,
+            cpu_s=time.process_time(),
+            sent=dict(node.sent),
+            edges=edge_report(node),
+            overheard=dict(self._source.counters),
+            incidents=dict(node.incidents),
+            waits=self.meter.waits(),
+            clocks={},
+            queues={},
         )
 
     def last_words(self) -> dict[str, object]:

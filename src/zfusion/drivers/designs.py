@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tomllib
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zfusion.methods import chosen
+from zfusion.methods.design_files import Content, read, write
 from zfusion.methods.family import Design, Modes
 from zfusion.model.scenario import Scenario
 
@@ -27,6 +29,12 @@ class _Wanted:
     scenario: Scenario = field(compare=False)
 
 
+class _Made(NamedTuple):
+    design: Design
+    content: bytes
+    """What its file holds."""
+
+
 def design_of(scenario: Scenario) -> Any:
     """The design of the scenario's method, None where there is no such thing.
 
@@ -34,18 +42,31 @@ def design_of(scenario: Scenario) -> Any:
     """
     if chosen(scenario).family.designer is None:
         return None
-    return _designed(_Wanted(_facts(scenario), scenario))
+    return _designed(_wanted(scenario)).design
+
+
+def content_of(scenario: Scenario) -> bytes | None:
+    """What a file of that design holds, None where there is none: for recordings. InputError as `design_of`."""
+    if chosen(scenario).family.designer is None:
+        return None
+    return _designed(_wanted(scenario)).content
 
 
 @lru_cache(maxsize=KEPT)
-def _designed(wanted: _Wanted) -> Design:
+def _designed(wanted: _Wanted) -> _Made:
+    """From its content in every case, so that the numbers are the same to the last bit wherever it comes from."""
     scenario = wanted.scenario
-    if scenario.method.design is None:
-        return make(scenario)
     method, designer = chosen(scenario), chosen(scenario).family.designer
     assert designer is not None  # the caller has looked
-    network, path = method.network(scenario.network), scenario.absolute(scenario.method.design)
-    return designer.load(path, method.options, scenario.system(), network, modes_of(scenario))
+    if scenario.carried_design is not None:
+        content = Content("the recording's design", scenario.carried_design)
+    elif scenario.method.design is not None:
+        content = read(scenario.absolute(scenario.method.design))
+    else:
+        content = Content("the design", make(scenario).packed())
+    network = method.network(scenario.network)
+    design = designer.unpack(content, method.options, scenario.system(), network, modes_of(scenario))
+    return _Made(design, content.data)
 
 
 def make(scenario: Scenario) -> Design:
@@ -65,25 +86,42 @@ def with_design(scenario: Scenario, path: Path) -> Scenario:
     The file that it names is checked; where it names none, the design is made and written to `path`. InputError as
     `design_of`, and where it cannot be written. A method without a design has the scenario as it is.
     """
-    design = design_of(scenario)
-    if design is None or scenario.method.design is not None:
+    content = content_of(scenario)
+    if content is None or (scenario.method.design is not None and scenario.carried_design is None):
         return scenario
-    design.save(path)
+    write(path, content)
     document = tomllib.loads(scenario.anchored().to_toml())
     method = document["method"] if isinstance(document["method"], dict) else {"name": document["method"]}
     document["method"] = method | {"design": str(path.absolute())}
     return Scenario.model_validate(document)
 
 
-def _facts(scenario: Scenario) -> str:
-    """All that a design depends on, as text."""
+def handed_on(old: Scenario, new: Scenario) -> Scenario:
+    """`new`, made of `old`, with the design that `old` carries where that is one for both."""
+    if old.carried_design is None or _purpose(old) != _purpose(new):
+        return new
+    return new.carrying(old.carried_design)
+
+
+def _wanted(scenario: Scenario) -> _Wanted:
+    return _Wanted(json.dumps(_purpose(scenario) | {"file": _origin(scenario)}), scenario)
+
+
+def _origin(scenario: Scenario) -> object:
+    """What tells one design for the same from another."""
+    if scenario.carried_design is not None:
+        return hashlib.sha256(scenario.carried_design).hexdigest()
     file = None if scenario.method.design is None else scenario.absolute(scenario.method.design)
     state = file.stat() if file is not None and file.exists() else None
+    return None if state is None else (str(file), state.st_mtime_ns, state.st_size)
+
+
+def _purpose(scenario: Scenario) -> dict[str, Any]:
+    """All that a scenario's design depends on, as plain data."""
     sensors = [s.model_dump(include={"H", "R", "noise"}, exclude_none=True) for s in scenario.sensors]
-    topology = scenario.links.topology
-    facts = {
-        "method": scenario.method.model_dump(),
-        "file": None if state is None else (str(file), state.st_mtime_ns, state.st_size),
+    topology, method = scenario.links.topology, scenario.method.with_paths(lambda path: str(scenario.absolute(path)))
+    return {
+        "method": method.model_dump(),
         "system": scenario.system_spec.model_dump(),
         "sensors": [(s.members, told) for s, told in zip(scenario.sensors, sensors, strict=True)],
         "noise": scenario.noise.model_dump(),
@@ -91,7 +129,6 @@ def _facts(scenario: Scenario) -> str:
         "weights": sorted(scenario.network.weights.items()),
         "topology": None if topology is None else topology.model_dump(),
     }
-    return json.dumps(facts)
 
 
 def modes_of(scenario: Scenario) -> Modes:

@@ -10,16 +10,18 @@ Everything happens on one thread. Zenoh's callbacks only leave notices, which ar
 from __future__ import annotations
 
 import gc
+import logging
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
 from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.complaints import Complaints
 from zfusion.drivers.credentials import node_name
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
@@ -31,19 +33,24 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, open_session, prober, publisher
+from zfusion.drivers.transport import RECEIPT, never_linger, open_session, prober, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
-from zfusion.model.types import NodeId
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.node import LOOKAHEAD, Ask, Effect, Node
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, Message
-from zfusion.status import Phase, Status
+from zfusion.status import Counts, Phase, Status
+
+log = logging.getLogger(__name__)
 
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
+
+LINGERLESS_NS = 1_000_000_000
+"""How often a node sees to the links that it was not told of; shorter than their lease."""
 
 AHEAD = 65_536
 """Messages kept here that are too far ahead for the node to take: what a swarm says in half a minute, while a node that
@@ -103,11 +110,12 @@ class LiveNode:
         self._stamped = False
         """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
-        self._told_ns = 0
+        self._told_ns = self._lingerless_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
         """Whether a paced step begins late, if it has to, rather than not at all."""
+        self._complaints = Complaints()
         self._misfortune = Misfortune(scenario, node, announce)
         link = links_of(scenario) if options.emulate else ideal
         config = scenario.transport.zenoh_config
@@ -169,8 +177,8 @@ class LiveNode:
         self.stopping = True
         self._inbox.notify(None)
 
-    def status(self) -> Status:
-        """How the node is doing."""
+    def status(self, *, counted: bool = False) -> Status:
+        """How the node is doing; what it has `counted` where that is wanted."""
         node, meeting = self.node, self._meeting
         return Status(
             node=self.id,
@@ -184,6 +192,7 @@ class LiveNode:
             fallbacks=node.fallbacks if node else 0,
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
+            counts=self._counts() if counted else None,
         )
 
     def report(self) -> NodeReport:
@@ -195,14 +204,31 @@ class LiveNode:
         for *_, heard in self._ahead:
             refused = report.edges[str(heard.message.node)]["refused"]
             refused["too_early"] = refused.get("too_early", 0) + 1
-        report.overheard = dict(Counter(report.overheard) + self._presence.overheard)
-        if self._inbox.overrun:
-            report.overheard["overrun"] = self._inbox.overrun
-        report.clocks = {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
-        report.queues = {"ahead": self._most_ahead, "held": self._hearing.most_held}
+        report.overheard = self._overheard(report.overheard)
+        report.clocks = self._clocks()
+        report.queues = self._queues()
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
         return report
+
+    def _counts(self) -> Counts | None:
+        """What was counted so far; None before the first step."""
+        if self._account is None:
+            return None
+        counts = self._account.counts()
+        return replace(
+            counts, overheard=self._overheard(counts.overheard), clocks=self._clocks(), queues=self._queues()
+        )
+
+    def _overheard(self, by_source: Mapping[str, int]) -> dict[str, int]:
+        total = Counter(by_source) + self._presence.overheard
+        return {**total, "overrun": self._inbox.overrun} if self._inbox.overrun else dict(total)
+
+    def _clocks(self) -> dict[str, dict[str, float]]:
+        return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+
+    def _queues(self) -> dict[str, int]:
+        return {"ahead": self._most_ahead, "held": self._hearing.most_held}
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
         """The source of the readings that a program of the user's publishes."""
@@ -241,6 +267,7 @@ class LiveNode:
         self.node, self.phase = node, Phase.RUNNING
         self._account = Account(node, self._source, first, stages=exchanged, marked_every=every)
         self._carry_out([node.event("started", now, epoch_ns=start.epoch_ns)])
+        log.info("begins with step %d, expecting %s", start.born, ", ".join(map(str, sorted_ids(start.expected))))
         self.tell_status()
         return node
 
@@ -420,6 +447,7 @@ class LiveNode:
         node = self.node
         if node is None:
             return
+        log.warning("node %s is gone", j)
         self._hearing.drain(j)
         heard = [self._last_heard[channel] for channel in self._hearing.channels(j) if channel in self._last_heard]
         last = [decode_any(data) for data in (*heard, *self._hearing.held(j)[:MOST_HELD])]
@@ -431,9 +459,20 @@ class LiveNode:
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
         self._told_ns = self._now()
+        if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
+            self._lingerless_ns = self._told_ns
+            self._complain()
+            never_linger()  # observers have links, too, and show no token
         self._presence.read_clocks(self._told_ns)
         if self._tell is not None:
             self._tell(self.status())
+
+    def _complain(self, *, ended: bool = False) -> None:
+        """Log what was refused."""
+        if self.node is not None and self._account is not None:
+            refused: dict[str, Mapping[str, int]] = {f"node {j}": c.refused for j, c in self.node.counters.items()}
+            refused["elsewhere"] = self._overheard(self._source.counters)
+            self._complaints.look(self._now(), refused, ended=ended)
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""
@@ -444,3 +483,5 @@ class LiveNode:
         self.tell_status()
         self._presence.take_leave()
         self._hearing.end()
+        self._complain(ended=True)
+        log.info("ends: %d steps completed, %d skipped", node.completed, self._account.skipped)

@@ -146,9 +146,7 @@ class Meter:
         if not ended and self._step < self._told_at + BATCH_STEPS:
             return
         self._told_at = self._step
-        for waits, pending in zip(self._waits, self._pending_waits, strict=True):
-            waits.add_all(pending)
-            pending.clear()
+        self._fold_waits()
         folded = ((j, stage, channel.fold()) for (j, stage), channel in self._channels.items())
         yield from _batches(folded)
 
@@ -165,8 +163,12 @@ class Meter:
                 "total_ns": channel.total_ns,
                 "budget_ns": dict(zip(PARTS, channel.budget, strict=True)),
             }
-        waits = {stage: waits.told() for stage, waits in zip(self._stages, self._waits, strict=True)}
-        return {"edges": edges, "waits": waits, "rounds": self._rounds, "rounds_ns": self._rounds_ns}
+        return {"edges": edges, "waits": self.waits(), "rounds": self._rounds, "rounds_ns": self._rounds_ns}
+
+    def waits(self) -> dict[str, dict[str, int]]:
+        """Stage -> how long it was open, up to now, as `Latencies.told`."""
+        self._fold_waits()
+        return {stage: waits.told() for stage, waits in zip(self._stages, self._waits, strict=True)}
 
     def budgets(self) -> dict[str, Any]:
         """What goes on a recording: rounds whose budget was kept, and edges {neighbour: {stage: nanoseconds of PARTS}}.
@@ -178,6 +180,11 @@ class Meter:
             for (j, stage), channel in self._channels.items():
                 edges.setdefault(str(j), {})[stage] = list(channel.budget)
         return {"rounds": self._rounds, "edges": edges}
+
+    def _fold_waits(self) -> None:
+        for waits, pending in zip(self._waits, self._pending_waits, strict=True):
+            waits.add_all(pending)
+            pending.clear()
 
     def _budget(self, marks: Sequence[int]) -> None:
         """Cut the round into its parts, for every channel."""

@@ -62,8 +62,8 @@ class Host(Protocol):
     phase: Phase
     stopping: bool
 
-    def status(self) -> Status:
-        """How it is doing."""
+    def status(self, *, counted: bool = False) -> Status:
+        """How it is doing; what it has `counted` where that is wanted."""
 
     def tell_status(self) -> None:
         """Tell the launcher how it is doing."""
@@ -246,12 +246,14 @@ class Presence:
                 self._host.part_with(j)
             return
         never_linger()  # there may be a new link
+        log.info("node %s is there", j)
         self.meeting.came(j)
         if self._host.node is not None:
             self._ask_status(j)
 
     def _on_recorder(self, sample: Any, _at_ns: int) -> None:
         self.meeting.recorder = sample.kind == zenoh.SampleKind.PUT
+        log.info("the recorder is %s", "there" if self.meeting.recorder else "gone")
         if not self.meeting.recorder:
             self._unconfirmed.discard(RECORDER)
 
@@ -300,7 +302,8 @@ class Presence:
     def _answer_status(self, query: Any, at_ns: int) -> None:
         with query:
             question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
-            status = replace(self._host.status(), heard_ns=at_ns, told_ns=self._now())
+            status = self._host.status(counted=question.get("counts") is True)
+            status = replace(status, heard_ns=at_ns, told_ns=self._now())
             query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
             asker = question.get("from")
             if isinstance(asker, int | str):

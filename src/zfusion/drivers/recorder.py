@@ -6,6 +6,8 @@ all that was published before it has arrived, so that nodes leave only when it h
 
 from __future__ import annotations
 
+import logging
+import platform
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -22,12 +24,15 @@ from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
 from zfusion.errors import MessageError
-from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any, encode_any
+from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, TRUTH_SENDER, Stage
+from zfusion.status import RecorderStatus
+
+log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
 """Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
@@ -202,22 +207,36 @@ class Recorder:
             if kind == "token":
                 self._on_token(about)
             else:
-                self._drain()  # the asker's messages are in the channel, before its question
-                with about:  # queries are to be dropped explicitly, see `live.QUESTIONS`
-                    about.reply(keys.recorder_status_key(self._run), encode_any({"messages": self._count().messages}))
+                self._answer(about)
         everybody_left = self._until_all_gone and self._seen == self._ids and not self._present
         if self._stopping or everybody_left:
             self._drain()
             return True
         return False
 
-    def _drain(self) -> None:
-        """Write what is there by now."""
-        for _ in range(CAPACITY):
+    def _answer(self, query: Any) -> None:
+        """Tell what is on the file, and how much waited for it."""
+        waiting = self._drain()  # the asker's messages are in the channel, before its question
+        report = self._count()
+        status = RecorderStatus(
+            messages=report.messages,
+            foreign=report.foreign,
+            lost=sum(self._writer.lost().values()),
+            waiting=waiting,
+            path=report.path,
+            host=platform.node(),
+        )
+        with query:  # queries are to be dropped explicitly, see `presence.QUESTIONS`
+            query.reply(keys.recorder_status_key(self._run), status.encode())
+
+    def _drain(self) -> int:
+        """Write what is there by now; how many messages that was."""
+        for number in range(CAPACITY):
             sample = self._inbox.poll_sample(CHANNEL)
             if sample is None:
-                return
+                return number
             self._write(sample, time.time_ns())
+        return CAPACITY
 
     def _on_token(self, sample: Any) -> None:
         try:
@@ -230,13 +249,16 @@ class Recorder:
             never_linger()  # there is a new link
             self._seen.add(node)
             self._present.add(node)
+            log.info("node %s is there", node)
         else:
             self._present.discard(node)
+            log.info("node %s is gone", node)
 
     def _finish(self) -> None:
         self._count()
         accounts = self._writer.finish(sent=self._sent, facts={"foreign": str(self._report.foreign)})
         self._report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
+        log.info("%d messages in %s", self._report.messages, self._report.path)
 
 
 def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:

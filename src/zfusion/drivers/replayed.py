@@ -495,12 +495,12 @@ def _verify_some(recording: Recording, scenario: Scenario, nodes: Sequence[NodeI
 
 
 def recorded_scenario(recording: Recording) -> Scenario:
-    """The scenario of a recording; ScenarioError if it cannot be read, or its method is unknown here."""
+    """The scenario of a recording, with the design that is on it; ScenarioError if it cannot be read here."""
     scenario = Scenario.from_toml(
         recording.scenario_toml, f"{recording.path}: scenario.toml", recording.path.absolute().parent
     )
     check_method(scenario, f"{recording.path}: scenario.toml")
-    return scenario
+    return scenario if recording.design is None else scenario.carrying(recording.design)
 
 
 def _inputs(message: Message) -> tuple[NodeId, ...]:

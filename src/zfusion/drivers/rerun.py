@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from zfusion import keys
+from zfusion.drivers.designs import handed_on
 from zfusion.drivers.metrics import Errors, NodeReport
 from zfusion.drivers.replayed import recorded_scenario
 from zfusion.drivers.simulated import simulate
@@ -104,7 +105,7 @@ def rerun(
     if output.exists() and output.samefile(recording.path):
         raise InputError(f"{output}: is the recording that is to be run again")
     old = recorded_scenario(recording)
-    wanted = scenario if isinstance(scenario, Scenario) else old.with_overrides(**scenario)
+    wanted = scenario if isinstance(scenario, Scenario) else handed_on(old, old.with_overrides(**scenario))
     recorded = read_recorded(recording, wanted)
     new = _on_recording(wanted, recording.path, min(wanted.steps, recorded.steps))
     sources = {i: TableSource(recorded.measurements[i], recorded.truths, recorded.refused[i]) for i in new.ids}
@@ -124,7 +125,7 @@ def with_recorded_links(scenario: Scenario, recording: Recording) -> Scenario:
         raise InputError(f"{recording.path}: no latencies were measured in it: it has no messages {ARRIVALS.name!r}")
     document = tomllib.loads(scenario.anchored().to_toml())
     document["links"] = {"recorded": {"recording": str(recording.path.absolute())}}
-    return Scenario.model_validate(document)
+    return handed_on(scenario, Scenario.model_validate(document))
 
 
 def on_recording(recording: Recording, scenario: Scenario | None = None) -> Scenario:
@@ -142,7 +143,7 @@ def _on_recording(scenario: Scenario, path: Path, steps: int) -> Scenario:
     for sensor in document["sensors"]:
         sensor.pop("source", None)
     document |= {"source": {"kind": "mcap", "recording": str(path.absolute())}, "steps": steps}
-    return Scenario.model_validate(document)
+    return handed_on(scenario, Scenario.model_validate(document))
 
 
 def read_recorded(recording: Recording, scenario: Scenario) -> Recorded:

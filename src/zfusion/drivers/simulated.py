@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from heapq import heappop, heappush
 from pathlib import Path
 
 from zfusion import keys
 from zfusion.drivers.account import Account, MakeMethod, make_node, truth_message
+from zfusion.drivers.agenda import Action, Agenda
+from zfusion.drivers.designs import content_of
 from zfusion.drivers.meters import MARKED_EVERY
 from zfusion.drivers.metrics import NodeReport
 from zfusion.drivers.sources import Source, open_sources
@@ -39,8 +40,6 @@ Record = Callable[[str, bytes, int], None]
 Observe = Callable[[Message, int], None]
 """(message, time) of every message that a node publishes, in order."""
 
-_Action = Callable[[], None]
-
 
 class _Life:
     """One node from its start to its end."""
@@ -65,7 +64,7 @@ class _Life:
         """The last step whose faults have been told."""
         self.frozen = False
         """It does nothing: what comes waits."""
-        self.waiting: list[tuple[bool, _Action]] = []
+        self.waiting: list[tuple[bool, Action]] = []
         """What waits, and whether it is to come after all else."""
 
 
@@ -105,16 +104,17 @@ class Simulation:
         epoch = scenario.timing.epoch_ns
         self.epoch_ns = EPOCH_NS if epoch is None else epoch
         """When step 0 is."""
-        self.now_ns = self.epoch_ns
-        """The virtual time."""
-        self._agenda: list[tuple[int, bool, int, _Action]] = []
-        self._entries = 0
-        self._awaited: list[tuple[int, _Action]] = []
-        """What is to happen when a free-running node begins a step (or, at the latest, when nothing else happens)."""
+        self._agenda = Agenda(self.epoch_ns)
+        self._at = self._agenda.at
         self._alive: dict[NodeId, _Life] = {}
         self._lives: dict[NodeId, list[_Life]] = {node: [] for node in self._graph.ids}
         for node in self._graph.ids:
             self._start(node, born=1)
+
+    @property
+    def now_ns(self) -> int:
+        """The virtual time."""
+        return self._agenda.now_ns
 
     @property
     def reports(self) -> dict[NodeId, list[NodeReport]]:
@@ -135,17 +135,7 @@ class Simulation:
 
     def run(self, until_ns: int | None = None) -> None:
         """Let everything happen that happens before a time; by default, until every node has taken its last step."""
-        agenda = self._agenda
-        while agenda or self._awaited:
-            if not agenda:
-                self._reach(min(step for step, _ in self._awaited))
-            elif until_ns is None or agenda[0][0] < until_ns:
-                self.now_ns, _, _, action = heappop(agenda)
-                action()
-            else:
-                break
-        if until_ns is not None:
-            self.now_ns = max(self.now_ns, until_ns)
+        self._agenda.run(until_ns)
 
     def kill(self, node: NodeId) -> None:
         """End a node's life without warning. What it has sent is on its way; its neighbours notice at once.
@@ -223,8 +213,7 @@ class Simulation:
             self._truth_step = step
             self._tell_truth(life, step)
         life.began_ns, life.busy = self.now_ns, True
-        if self._awaited:
-            self._reach(step)
+        self._agenda.reach(step)
         life.meter.begin(step, self.now_ns + life.clock_ns)
         self._carry_out(life, node.begin(step, y, self.now_ns + life.clock_ns, due))
 
@@ -281,22 +270,15 @@ class Simulation:
         if node not in self._alive and born <= self._scenario.steps:
             self._revive(node, born)
 
-    def _when(self, step: int, action: _Action) -> None:
+    def _when(self, step: int, action: Action) -> None:
         """Put on the agenda for the time at which a step is due; where steps have none, for when somebody begins it."""
         period = self._scenario.timing.period_ns
         if period is None:
-            self._awaited.append((step, action))
+            self._agenda.at_step(step, action)
         else:
             self._at(max(self.now_ns, self.epoch_ns + step * period), action)
 
-    def _reach(self, step: int) -> None:
-        """Somebody begins a step: let happen what waits for that."""
-        due = [action for at, action in self._awaited if at <= step]
-        self._awaited = [(at, action) for at, action in self._awaited if at > step]
-        for action in due:
-            self._at(self.now_ns, action)
-
-    def _is_held(self, life: _Life, action: _Action, last: bool = False) -> bool:
+    def _is_held(self, life: _Life, action: Action, last: bool = False) -> bool:
         """Whether the node does not do this now: it is dead, or it stands still and does it later."""
         if self._alive.get(life.node.id) is not life:
             return True
@@ -463,11 +445,6 @@ class Simulation:
             life.meter.there(now)
             self._carry_out(life, life.node.tick(now))
 
-    def _at(self, time_ns: int, action: _Action, last: bool = False) -> None:
-        """Put on the agenda; `last`: behind all else that happens at that time."""
-        self._entries += 1
-        heappush(self._agenda, (time_ns, last, self._entries, action))
-
 
 def simulate(
     scenario: Scenario,
@@ -499,6 +476,7 @@ def simulate(
         method=method,
         seed=scenario.seed,
         stages=chosen(scenario).stages,
+        design=content_of(scenario),
         facts={"world": "simulated"},
     ) as writer:
         simulation = Simulation(scenario, run=run, link=link, record=writer.write, sources=sources, observe=observe)

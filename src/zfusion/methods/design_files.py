@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -29,6 +31,14 @@ HEAD = ("format", "version", "method", "fingerprint")
 Arrays = Mapping[str, NDArray[np.generic]]
 
 
+class Content(NamedTuple):
+    """What is in a design file, wherever that was."""
+
+    source: str
+    """What errors call it."""
+    data: bytes
+
+
 class DesignFileError(InputError):
     """A design file that cannot be used: missing, damaged, of another version, method or system."""
 
@@ -47,23 +57,38 @@ def fingerprint(parts: Iterable[tuple[str, object]]) -> str:
     return digest.hexdigest()
 
 
-def save(path: Path, method: str, made_for: str, arrays: Arrays) -> None:
-    """Write the design of a method for what has the fingerprint `made_for`; InputError where that cannot be done."""
+def packed(method: str, made_for: str, arrays: Arrays) -> bytes:
+    """What a file is to hold: the design of a method for what has the fingerprint `made_for`."""
     head = {"format": FORMAT, "version": VERSION, "method": method, "fingerprint": made_for}
     if clash := set(head) & set(arrays):
         raise ValueError(f"these names are taken: {sorted(clash)}")
+    file = BytesIO()
+    named = {name: np.asarray(value) for name, value in (head | dict(arrays)).items()}
+    np.savez_compressed(file, allow_pickle=False, **named)
+    return file.getvalue()
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write what was `packed`; InputError where that cannot be done."""
     try:
-        with path.open("wb") as file:
-            np.savez_compressed(
-                file, allow_pickle=False, **{name: np.asarray(value) for name, value in (head | dict(arrays)).items()}
-            )
+        path.write_bytes(data)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def load(path: Path, method: str, made_for: str | None = None) -> dict[str, NDArray[np.generic]]:
+def read(path: Path) -> Content:
+    """What is in a file, whatever that is; DesignFileError where it cannot be read."""
+    try:
+        return Content(str(path), path.read_bytes())
+    except FileNotFoundError:
+        raise DesignFileError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise DesignFileError(f"{path}: not a design file of zfusion ({error})") from None
+
+
+def unpack(content: Content, method: str, made_for: str | None = None) -> dict[str, NDArray[np.generic]]:
     """The arrays of a design; DesignFileError unless it is one of this method, and for `made_for` where given."""
-    arrays = _read(path)
+    path, arrays = content.source, _arrays(content)
     said = {name: arrays.pop(name, np.array(None)).tolist() for name in HEAD}
     if said["format"] != FORMAT:
         raise DesignFileError(f"{path}: not a design file of zfusion")
@@ -83,14 +108,11 @@ def stored_ids(ids: Iterable[NodeId]) -> NDArray[np.generic]:
     return np.array(list(ids))
 
 
-def _read(path: Path) -> dict[str, NDArray[np.generic]]:
+def _arrays(content: Content) -> dict[str, NDArray[np.generic]]:
     try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise DesignFileError(f"{path}: not a design file of zfusion (a single array)")
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise DesignFileError(f"{path}: there is no such file") from None
+        archive = np.load(BytesIO(content.data), allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise DesignFileError(f"{content.source}: not a design file of zfusion (a single array)")
+        return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, BadZipFile, EOFError) as error:
-        raise DesignFileError(f"{path}: not a design file of zfusion ({error})") from None
+        raise DesignFileError(f"{content.source}: not a design file of zfusion ({error})") from None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.protocol import Method, Setting
 from zfusion.model.checks import ModelError
 from zfusion.model.network import Network
@@ -32,7 +33,7 @@ class Modes(NamedTuple):
 class Forecast(NamedTuple):
     """What is known of a method's errors before it runs; what nothing is known of is left out, or None.
 
-    Names are words joined by "_". Mean squared errors are stationary, with every message there.
+    Names are words joined by "_". Mean squared errors are stationary.
     """
 
     network: Mapping[str, float | str | None]
@@ -41,6 +42,8 @@ class Forecast(NamedTuple):
     """By what it is a number for every node, in the order of their ids."""
     remarks: Sequence[str] = ()
     """What a reader of the numbers must know, in sentences."""
+    given: str = "with every message there"
+    """What they take for granted of the links."""
 
 
 class Design(Protocol):
@@ -53,6 +56,9 @@ class Design(Protocol):
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
 
+    def packed(self) -> bytes:
+        """What such an archive holds."""
+
 
 class Designer(Protocol):
     """How a method is designed off-line."""
@@ -60,8 +66,8 @@ class Designer(Protocol):
     def make(self, options: Any, system: System, network: Network, modes: Modes) -> Design:
         """Design it: InputError where that cannot be done, with the numbers."""
 
-    def load(self, path: Path, options: Any, system: System, network: Network, modes: Modes) -> Design:
-        """Read what `Design.save` wrote; InputError unless it is a design for just this."""
+    def unpack(self, content: Content, options: Any, system: System, network: Network, modes: Modes) -> Design:
+        """What `Design.packed` has packed; InputError unless it is a design for just this."""
 
 
 def _as_it_is(graph: Network) -> Network:
@@ -70,6 +76,10 @@ def _as_it_is(graph: Network) -> Network:
 
 def _none(_: object) -> int:
     return 0
+
+
+def _no_warnings(options: object, system: System, network: Network) -> Sequence[str]:  # noqa: ARG001
+    return ()
 
 
 @dataclass(frozen=True)
@@ -96,6 +106,8 @@ class Family:
     """Refuses, with an InputError or ModelError, a system or a network that the method cannot stand."""
     note: str = ""
     """What a user of the method must know of every run: told in its summary."""
+    warnings: Callable[[Any, System, Network], Sequence[str]] = _no_warnings
+    """What a user must know of just this system, with these options: likewise."""
 
     def choose(self, options: Mapping[str, object]) -> Chosen:
         """The method with these options, as a scenario gives them; ModelError for what cannot be."""

@@ -7,7 +7,7 @@ arrived, publishes the next stage, and so on, until `advance` of the last stage 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -88,6 +88,14 @@ class Wary(Protocol):
 
         A function of its arguments only: so what was refused is so again in a replay, or is not there.
         """
+
+
+@runtime_checkable
+class Selective(Protocol):
+    """A method that knows at which steps a neighbour is not to be heard, so that nobody waits for it then."""
+
+    def unheard(self, step: int) -> Collection[NodeId]:
+        """The neighbours of whom nothing can come at a step."""
 
 
 class Revising(Method, Protocol):

@@ -98,6 +98,7 @@ class Scenario(Spec):
 
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _origin: str = PrivateAttr(default="scenario")
+    _design: bytes | None = PrivateAttr(default=None)
 
     @classmethod
     def from_toml(cls, text: str, source: str = "scenario", directory: Path | None = None) -> Self:
@@ -219,6 +220,17 @@ class Scenario(Spec):
         document = self._document() | others | {"sensors": sensors}
         return self._from_document(document, self._origin, self._directory)
 
+    def carrying(self, design: bytes | None) -> Self:
+        """The same scenario with the content of its design file, which then is read nowhere; None: without."""
+        scenario = self._from_document(self._document(), self._origin, self._directory)
+        scenario._design = design
+        return scenario
+
+    @property
+    def carried_design(self) -> bytes | None:
+        """What `carrying` gave it; what is made of it by other means carries nothing."""
+        return self._design
+
     def with_overrides(self, **overrides: Unpack[Overrides]) -> Self:
         """The scenario with these in the place of what it says; ScenarioError if that cannot be."""
         origin = _origin_of(self._origin, overrides)
@@ -265,7 +277,9 @@ class Scenario(Spec):
         facts = self.method.with_paths(_file_name).model_dump(exclude_none=True)
         if self.method.design is not None:
             with suppress(OSError):  # whoever reads it as a design says so
-                facts["design"] = hashlib.sha256(self.absolute(self.method.design).read_bytes()).hexdigest()
+                carried = self._design
+                content = self.absolute(self.method.design).read_bytes() if carried is None else carried
+                facts["design"] = hashlib.sha256(content).hexdigest()
         return facts
 
     def _sensor_facts(self, i: NodeId) -> dict[str, Any]:

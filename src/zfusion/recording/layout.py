@@ -2,6 +2,7 @@
 
 Metadata  zfusion.recording   first record of the file: format, run, method, seed, versions, machine, clocks
 Attachment scenario.toml      the scenario
+Attachment design.npz         the design of its method, where that is designed off-line
 Chunks                        one channel per Zenoh key; message data are the wire bytes
 Metadata  zfusion.stats       at the close: the account of every topic
 Metadata  zfusion.close       at the close: how the recording ended
@@ -26,6 +27,9 @@ CLOSE = "zfusion.close"
 
 SCENARIO = "scenario.toml"
 SCENARIO_TYPE = "application/toml"
+
+DESIGN = "design.npz"
+DESIGN_TYPE = "application/zip"
 
 CHECKSUM = "checksum"
 

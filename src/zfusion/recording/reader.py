@@ -107,6 +107,8 @@ class Recording:
         self.closing: Mapping[str, str] = contents.metadata.get(layout.CLOSE, {})
         """The facts of `zfusion.close`: how the recording ended; empty for one that was broken off."""
         self.scenario_toml = contents.attachments[layout.SCENARIO].decode()
+        self.design = contents.attachments.get(layout.DESIGN)
+        """What the file of the method's design held; None where it has none, or nobody attached it."""
         self.topics: Mapping[str, int] = {
             topic: contents.counts.get(channel, 0) for channel, topic in sorted(contents.channels.items())
         }

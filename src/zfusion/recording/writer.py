@@ -42,9 +42,10 @@ class RecordingWriter:
     """An open recording. A context manager: leaving it finishes the file.
 
     `path` must be in a directory that is there; a file there is replaced. `stages` are those of the method beside the
-    built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `facts` are what
-    else the caller knows of the run and wants on the file. RecordingError if the file cannot be made; RunError from
-    any method when writing fails (disk full): the file is closed then, and readable up to there.
+    built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `design` is what the
+    file of the method's design holds. `facts` are what else the caller knows of the run and wants on the file.
+    RecordingError if the file cannot be made; RunError from any method when writing fails (disk full): the file is
+    closed then, and readable up to there.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class RecordingWriter:
         method: str,
         seed: int | None,
         stages: Iterable[Stage] = (),
+        design: bytes | None = None,
         facts: Mapping[str, str] | None = None,
     ) -> None:
         self.is_legal: Callable[[str, bytes], bool] = lambda _topic, _data: True
@@ -76,7 +78,7 @@ class RecordingWriter:
             raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         with self._writing():
-            self._begin(dict(facts or {}) | origin | software() | machine() | start, scenario_toml)
+            self._begin(dict(facts or {}) | origin | software() | machine() | start, scenario_toml, design)
 
     def write(self, topic: str, data: bytes, arrival_ns: int) -> None:
         """Record `data`, that came on the key `topic` at `arrival_ns`.
@@ -109,6 +111,11 @@ class RecordingWriter:
         """Hand all that was written to the operating system: it survives the death of this process."""
         with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def lost(self) -> dict[str, int]:
+        """By topic: what is missing so far between the messages that came, where anything is."""
+        between = {topic: channel.counter.gaps().lost_between for topic, channel in self._channels.items()}
+        return {topic: lost for topic, lost in between.items() if lost}
 
     def sync(self) -> None:
         """Have the operating system put what was flushed on the disk: it survives a power cut. Takes 4 to 50 ms."""
@@ -150,19 +157,18 @@ class RecordingWriter:
     ) -> None:
         self.finish()
 
-    def _begin(self, facts: Mapping[str, str], scenario_toml: str) -> None:
+    def _begin(self, facts: Mapping[str, str], scenario_toml: str, design: bytes | None) -> None:
         """Put on the disk what makes even a recording that breaks off here one that can be read."""
         now = int(facts["clock_realtime_ns"])
         self._writer.start(profile=layout.PROFILE)
         self._writer.add_metadata(layout.RECORDING, layout.sealed(facts))
-        self._writer.add_attachment(
-            create_time=now,
-            log_time=now,
-            name=layout.SCENARIO,
-            media_type=layout.SCENARIO_TYPE,
-            data=scenario_toml.encode(),
-        )
+        self._attach(now, layout.SCENARIO, layout.SCENARIO_TYPE, scenario_toml.encode())
+        if design is not None:
+            self._attach(now, layout.DESIGN, layout.DESIGN_TYPE, design)
         self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def _attach(self, now: int, name: str, media_type: str, data: bytes) -> None:
+        self._writer.add_attachment(create_time=now, log_time=now, name=name, media_type=media_type, data=data)
 
     def _add_channel(self, topic: str) -> _Channel | None:
         """A channel for `topic`; None if the file can hold no more."""

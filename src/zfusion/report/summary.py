@@ -132,8 +132,10 @@ def summarize(
 
 def notes_of(scenario: Scenario) -> list[str]:
     """What a user of the scenario's method must know of every run."""
-    note = chosen(scenario).family.note
-    return [note] if note else []
+    method = chosen(scenario)
+    note = method.family.note
+    warnings = method.family.warnings(method.options, scenario.system(), method.network(scenario.network))
+    return [*([note] if note else []), *warnings]
 
 
 def _edges(

@@ -7,50 +7,33 @@ What a method computes in is measured in CPU time of this machine: the only numb
 
 from __future__ import annotations
 
-import time
-import tomllib
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zfusion import keys
-from zfusion.drivers.designs import with_design
-from zfusion.drivers.rerun import on_recording, read_recorded
-from zfusion.drivers.simulated import Simulation
-from zfusion.errors import InputError, ZfusionError
-from zfusion.methods import METHODS, chosen
-from zfusion.methods.check import check_method
+from zfusion.errors import InputError
+from zfusion.methods import chosen
 from zfusion.methods.prediction import predict
-from zfusion.methods.protocol import Fields, Method, Outcome, Revising, Setting, Wary
 from zfusion.methods.two_stage import CENTRALIZED
-from zfusion.model.network import Network
-from zfusion.model.sampling import SamplePath
-from zfusion.model.scenario import Overrides, Scenario
-from zfusion.model.types import Array, NodeId
-from zfusion.recording.reader import Recording
-from zfusion.stages import ESTIMATE, Message, Stage
+from zfusion.model.scenario import Scenario
+from zfusion.model.types import Array
 from zfusion.studies.compare import (
     ALL,
     CONFIDENCE,
     SHORTEST,
     STRETCHES,
     Comparison,
-    common_steps,
     means_over_steps,
     paired_by_node,
-    series_of,
 )
+from zfusion.studies.contestants import Field
 from zfusion.studies.intervals import Interval, mean_interval
+from zfusion.studies.method_runs import Cost, SeedRun, run_all
 from zfusion.studies.parallel import in_order
-from zfusion.studies.settings import parse_settings, with_settings
-from zfusion.used_sets import Ledger, UsedSet
 
 BELIEVED = 0.05
 """By how much of itself a mean NEES may be off before covariances are not to be believed."""
@@ -59,26 +42,6 @@ WORTH_PROCESSES = 2_000
 """Steps of all nodes, methods and seeds from which on processes share the work: to start one takes a second."""
 
 Progress = Callable[[int], None]
-
-
-@dataclass(frozen=True)
-class Contestant:
-    """A method that can run: under the scenario's links, and, where it has any, on the ideal network too."""
-
-    label: str
-    scenario: Scenario
-    ideal: Scenario | None
-
-
-@dataclass(frozen=True)
-class Field:
-    """All that are compared, and who could not be."""
-
-    contestants: Sequence[Contestant]
-    refused: Mapping[str, str]
-    """By label the reason, in one line."""
-    truths: Mapping[int, Array] | None = None
-    """By step, of a recording; None where each seed draws its own."""
 
 
 @dataclass(frozen=True)
@@ -181,85 +144,6 @@ class MethodComparison:
         }
 
 
-def field_of(scenario: Scenario, labels: Sequence[str], designs: Path) -> Field:
-    """The methods that can stand the scenario, and the reasons of those that cannot; designs go into `designs`.
-
-    A label is a method's name, with options after colons: ``consensus:rounds=8:step_size=fastest``. InputError for a
-    name that is no method's or comes twice, and where nobody is left.
-    """
-    if len(set(labels)) != len(labels):
-        raise InputError(f"--methods: expected every method once (is {', '.join(labels)})")
-    contestants, refused = [], {}
-    for number, label in enumerate(labels):
-        try:
-            contestants.append(_contestant(scenario, label, designs / f"{number}.npz"))
-        except UnknownMethodError:
-            raise
-        except ZfusionError as error:
-            refused[label] = _one_line(error, label)
-    if not contestants:
-        told = "; ".join(f"{label}: {reason}" for label, reason in refused.items())
-        raise InputError(f"no method can stand {scenario.name}: {told}")
-    return Field(contestants, refused)
-
-
-def field_of_recording(
-    recording: Recording, labels: Sequence[str], designs: Path, overrides: Overrides | None = None
-) -> Field:
-    """The same for the measurements on a recording, under its scenario's links or others.
-
-    InputError also where the truth is not on it.
-    """
-    scenario = on_recording(recording).with_overrides(**(overrides or {}))
-    truths = read_recorded(recording, scenario).truths
-    if not truths:
-        raise InputError(f"{recording.path}: the true state is not on it: there is nothing to set estimates beside")
-    field = field_of(scenario, labels, designs)
-    return Field(field.contestants, field.refused, truths)
-
-
-class UnknownMethodError(InputError):
-    """A name that is no method's."""
-
-
-def _contestant(scenario: Scenario, label: str, design: Path) -> Contestant:
-    name, *settings = label.split(":")
-    if name not in METHODS:
-        raise UnknownMethodError(f"--methods: expected some of {', '.join(METHODS)} (is {name!r})")
-    if settings:
-        changed = {"name": name, "options": parse_settings(settings, "--methods")}
-        scenario = with_settings(scenario, {"method": changed}, label)
-    else:
-        scenario = scenario.with_overrides(method=name)
-        check_method(scenario, label)
-    scenario = _ready(scenario, design)
-    ideal = _without_links(scenario)
-    return Contestant(label, scenario, None if ideal is None else _ready(ideal, design.with_suffix(".ideal.npz")))
-
-
-def _ready(scenario: Scenario, design: Path) -> Scenario:
-    """With its design in a file, and known to start."""
-    scenario = with_design(scenario, design)
-    Simulation(scenario).close()
-    return scenario
-
-
-def _without_links(scenario: Scenario) -> Scenario | None:
-    """The scenario on an ideal network; None where it has that anyway."""
-    if not scenario.links.model_fields_set and not scenario.faults:
-        return None
-    document = tomllib.loads(scenario.anchored().to_toml())
-    if scenario.links.topology is not None and isinstance(document.get("method"), dict):
-        document["method"].pop("design", None)  # it is one for those topologies
-    kept = {key: value for key, value in document.items() if key not in ("links", "faults")}
-    return Scenario.model_validate(kept)
-
-
-def _one_line(error: ZfusionError, label: str) -> str:
-    lines = [line.removeprefix(f"{label}: ").removesuffix(" (is None)") for line in str(error).splitlines()]
-    return "; ".join(line.removeprefix(f"method {label.partition(':')[0]}: ") for line in lines)
-
-
 def compare_methods(
     field: Field, seeds: Sequence[int], *, jobs: int = 1, progress: Progress | None = None
 ) -> MethodComparison:
@@ -272,8 +156,8 @@ def compare_methods(
         raise InputError("the true state is not known where measurements are not simulated")
     if not (seeds or field.truths):
         raise InputError("seeds: expected 1 or more")
-    found: list[_Seed] = []
-    work = partial(_run_all, field)
+    found: list[SeedRun] = []
+    work = partial(run_all, field)
     configurations = sum(1 + (one.ideal is not None) for one in field.contestants)
     if configurations * len(seeds) * first.steps * len(first.ids) < WORTH_PROCESSES:
         jobs = 1
@@ -290,143 +174,6 @@ def compare_methods(
     return _judged(field, unit, errors, nees / first.system().nx, [one.costs for one in found])
 
 
-class _Cost(NamedTuple):
-    messages: int
-    bytes: int
-    ns: Sequence[int]
-    """Of every node and step."""
-
-
-class _Seed(NamedTuple):
-    errors: Sequence[Array]
-    """Squared, by configuration, (steps, m): the contestants, then their ideal twins where there are any."""
-    nees: Sequence[Array]
-    costs: Sequence[_Cost]
-    """By contestant."""
-
-
-def _run_all(field: Field, seed: int | None) -> _Seed:
-    scenarios = [one.scenario for one in field.contestants]
-    ideals = [one.ideal for one in field.contestants if one.ideal is not None]
-    if seed is not None:
-        scenarios = [scenario.with_overrides(seed=seed) for scenario in scenarios]
-        ideals = [scenario.with_overrides(seed=seed) for scenario in ideals]
-    truth = _truth(scenarios[0], field.truths)
-    runs = [_observed(scenario) for scenario in scenarios]
-    estimates = [told for told, _ in runs] + [_observed(scenario)[0] for scenario in ideals]
-    ids = scenarios[0].ids
-    errors = common_steps([series_of(iter(told), ids, truth, "mse") for told in estimates])
-    nees = [_nees(told, ids, truth) for told in estimates[: len(scenarios)]]
-    return _Seed(errors, nees, [cost for _, cost in runs])
-
-
-def _truth(scenario: Scenario, recorded: Mapping[int, Array] | None) -> Array:
-    """(steps + 1, nx), NaN where it is not known."""
-    if recorded is None:
-        path = SamplePath(scenario.system(), scenario.seed)
-        return np.array([path.truth(k) for k in range(scenario.steps + 1)])
-    truth = np.full((scenario.steps + 1, scenario.system().nx), np.nan)
-    for step, x in recorded.items():
-        if step <= scenario.steps:
-            truth[step] = x
-    return truth
-
-
-def _nees(estimates: Sequence[Message], ids: Sequence[NodeId], truth: Array) -> Array:
-    try:
-        return series_of(iter(estimates), ids, truth, "nees")
-    except InputError:  # an error that is predicted to be zero in some direction
-        return np.full((len(truth) - 1, len(ids)), np.nan)
-
-
-def _observed(scenario: Scenario) -> tuple[list[Message], _Cost]:
-    """Simulate it: its estimates, and what it cost."""
-    make, told, timed, payloads = chosen(scenario), list[Message](), list[_Timed](), Counter[tuple[str, str]]()
-    sizes: Counter[tuple[str, str]] = Counter()
-
-    def method(setting: Setting) -> Method:
-        made = make(setting)
-        timed.append(_TimedAndWary(made) if isinstance(made, Wary) else _Timed(made))
-        return timed[-1]
-
-    def observe(message: Message, _now_ns: int) -> None:
-        if message.stage == ESTIMATE.name:
-            told.append(message)
-
-    def record(key: str, payload: bytes, _now_ns: int) -> None:
-        with suppress(ZfusionError):
-            said = keys.parse(key)
-            payloads[str(said.node), said.stage] += 1
-            sizes[str(said.node), said.stage] += len(payload)
-
-    simulation = Simulation(scenario, method=method, observe=observe, record=record)
-    try:
-        simulation.run()
-    finally:
-        simulation.close()
-    listeners = _listeners(make.network(scenario.network))
-    exchanged = {stage.name for stage in make.stages}
-    sent = [
-        (listeners[node] * count, listeners[node] * sizes[node, stage])
-        for (node, stage), count in payloads.items()
-        if stage in exchanged
-    ]
-    ns = [spent for one in timed for spent in one.spent_ns.values()]
-    return told, _Cost(sum(count for count, _ in sent), sum(size for _, size in sent), ns)
-
-
-def _listeners(graph: Network) -> Counter[str]:
-    """How many others hear each node."""
-    return Counter(str(j) for i in graph.ids for j in graph.neighbours(i) if j != i)
-
-
-class _Timed:
-    """A method, and the CPU time that it took by step."""
-
-    def __init__(self, method: Method) -> None:
-        self._method = method
-        self.spent_ns: Counter[int] = Counter()
-        self._step = 0
-
-    @property
-    def stages(self) -> tuple[Stage, ...]:
-        return self._method.stages
-
-    def begin(self, step: int, y: Array | None) -> Fields:
-        self._step, began = step, time.process_time_ns()
-        fields = self._method.begin(step, y)
-        self.spent_ns[step] += time.process_time_ns() - began
-        return fields
-
-    def skip(self, step: int) -> None:
-        self._method.skip(step)
-
-    def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:
-        began = time.process_time_ns()
-        result = self._method.advance(stage, step, arrived, ledger)
-        self.spent_ns[step] += time.process_time_ns() - began
-        return result
-
-    def revise(self, late: Mapping[int, Mapping[NodeId, Fields]]) -> dict[int, UsedSet]:
-        began = time.process_time_ns()
-        taken = cast(Revising, self._method).revise(late)
-        self.spent_ns[self._step] += time.process_time_ns() - began
-        return taken
-
-    def correct(self, step: int, heard: Mapping[NodeId, Fields]) -> Outcome:
-        began = time.process_time_ns()
-        outcome = cast(Revising, self._method).correct(step, heard)
-        self.spent_ns[self._step] += time.process_time_ns() - began
-        return outcome
-
-
-class _TimedAndWary(_Timed):
-    """Of a method that refuses messages."""
-
-    def refuses(self, stage: int, fields: Fields) -> str | None:
-        return cast(Wary, self._method).refuses(stage, fields)
-
-
 def _cut(series: Sequence[Array], scenario: Scenario) -> Array:
     """(stretches, configurations, m); InputError where there are not two."""
     count = min(STRETCHES, len(series[0]) // SHORTEST)
@@ -436,7 +183,7 @@ def _cut(series: Sequence[Array], scenario: Scenario) -> Array:
     return np.array([[means_over_steps(part[n]) for part in parts] for n in range(count)])
 
 
-def _judged(field: Field, unit: str, errors: Array, nees: Array, costs: Sequence[Sequence[_Cost]]) -> MethodComparison:
+def _judged(field: Field, unit: str, errors: Array, nees: Array, costs: Sequence[Sequence[Cost]]) -> MethodComparison:
     """From (units, configurations, m)."""
     contestants = field.contestants
     scenario, count = contestants[0].scenario, len(contestants)

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
@@ -22,6 +22,7 @@ from typing import Any
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
+from zfusion.drivers.registry import Entry, registered
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
@@ -47,8 +48,8 @@ PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
 between our finding it free and the node's listening on it."""
 
-_tried = count(os.getpid() * 61)
-"""Two launchers begin at different places."""
+BLOCK = 200
+"""Ports that one process at a time takes from."""
 
 DESIGN = "design.npz"
 """Among the logs: what all nodes share, where the method is designed off-line and the scenario names no file."""
@@ -156,7 +157,8 @@ class Launcher:
                 for child in self._everybody():
                     if child is not self._network:
                         self._start(child)
-            self._watch_nodes()
+            with registered(self._entry()):
+                self._watch_nodes()
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
@@ -183,6 +185,7 @@ class Launcher:
         scenario, options = self._scenario, self._options
         transport, common = scenario.transport, ["--run", options.run]
         listens, recorder_dials = self._endpoints()
+        self._dials, self._recorder_listens = recorder_dials, ""
         nodes: dict[NodeId, Child] = {}
         for place, i in enumerate(scenario.ids):
             command = [*ZFUSION, "node", str(self._file), "--id", str(i), *common]
@@ -199,6 +202,8 @@ class Launcher:
             command = [*ZFUSION, "record", str(self._file), *common, "-o", str(options.recording)]
             if self._network is not None or not transport.zenoh_config:
                 command += _each("--connect", [recorder_dials[i] for i in scenario.ids])
+                [self._recorder_listens] = free_endpoints(1)  # for observers: peers pass nothing on
+                command += ["--listen", self._recorder_listens]
             recorder = Child("the recorder", None, command, options.logs / "recorder.log", len(scenario.ids))
         return recorder, nodes
 
@@ -210,6 +215,21 @@ class Launcher:
             return {p.node: p.endpoint for p in where}, {p.node: p.recorder_dials for p in where}
         listens = dict(zip(ids, free_endpoints(len(ids)), strict=True)) | self._scenario.transport.endpoints
         return listens, listens
+
+    def _entry(self) -> Entry:
+        """What observers on this machine need in order to look at the run."""
+        transport, network = self._scenario.transport, self._network
+        own = None if network is not None else transport.zenoh_config
+        enter = network.status.get("enter", ()) if network is not None else ()
+        return Entry(
+            run=self._options.run,
+            scenario=self._scenario.name,
+            endpoints={str(i): endpoint for i, endpoint in self._dials.items()},
+            recorder=self._recorder_listens if self._recorder is not None else None,
+            low_latency=transport.preset == "lowlatency",
+            config=str(self._scenario.absolute(own)) if own else None,
+            enter=tuple(enter[len(self._scenario.ids)]) if enter else (),
+        )
 
     def _plan_network(self) -> Child | None:
         options = self._options
@@ -455,7 +475,7 @@ def free_endpoints(number: int) -> list[str]:
                 break
             sockets.append(socket.socket())
             try:
-                sockets[-1].bind(("127.0.0.1", PORTS[next(_tried) % len(PORTS)]))
+                sockets[-1].bind(("127.0.0.1", next(_ports)))
             except OSError:
                 sockets.pop().close()
         if len(sockets) < number:
@@ -464,6 +484,26 @@ def free_endpoints(number: int) -> list[str]:
     finally:
         for s in sockets:
             s.close()
+
+
+def _own_ports() -> Iterator[int]:
+    """Ports, without end, of blocks that no other process takes ports from meanwhile.
+
+    What is free for one launcher is free for another, too, until the node listens: both would give it away. So a
+    block is his who holds its first port; one that somebody else holds is passed over, after a port that is not free.
+    """
+    blocks = [PORTS[first : first + BLOCK] for first in range(0, len(PORTS), BLOCK)]
+    for n in count(os.getpid()):
+        mark, *ports = blocks[n % len(blocks)]
+        with socket.socket() as holder:
+            try:
+                holder.bind(("127.0.0.1", mark))
+            except OSError:
+                ports = [mark]
+            yield from ports
+
+
+_ports = _own_ports()
 
 
 def is_stopped(pid: int) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from zfusion.errors import InputError
 from zfusion.methods.delay_aware.companions import Augmented, Packet, Stamped
-from zfusion.methods.delay_aware.constant import best_gain, settled
+from zfusion.methods.delay_aware.constant import best_gain, moment_radius, settled
 from zfusion.methods.delay_aware.mapping import METHOD, Model, check_noises
 from zfusion.methods.delay_aware.options import ESTIMATED, DelayAwareOptions
 from zfusion.methods.delay_aware.recursion import Filter
@@ -181,6 +181,25 @@ def _forecast(options: DelayAwareOptions, system: System, network: Network) -> F
         {"mse": sum(stepwise), "constant_mse": sum(constant)},
         {"mse": stepwise, "constant_mse": constant},
         ("errors are those of one-step predictions of the plain filter; constant_mse: with the best constant gain",),
+        given="with delays and losses as the option probabilities says, drawn afresh at each step",
+    )
+
+
+def _warnings(options: DelayAwareOptions, system: System, network: Network) -> tuple[str, ...]:  # noqa: ARG001
+    """Where E[x xᵀ] grows without bound, what is random grows with it: all but what is certain is noise."""
+    F = system.F.items[0]
+    if system.F.constant_from != system.F.first:
+        return ()
+    given = options.probabilities
+    lists = given.values() if isinstance(given, Mapping) else () if given == ESTIMATED else (given,)
+    certain = options.companion == "stamped" or (given != ESTIMATED and all(p in (0, 1) for one in lists for p in one))
+    random = F.is_random or any(h.is_random for sensor in system.sensors for h in sensor.H.items)
+    radius = moment_radius(F.mean, F.factors)
+    if radius < 1 or (certain and not random):
+        return ()
+    return (
+        f"delay_aware: E[x x^T] grows without bound (spectral radius {radius:.6g}, not below 1), and the mean squared "
+        "error with it wherever gains, delays or losses are random",
     )
 
 
@@ -211,5 +230,6 @@ DELAY_AWARE = Family(
     lateness=lambda options: cast(DelayAwareOptions, options).lateness,
     forecast=_forecast,
     check=_check,
+    warnings=_warnings,
     note="late measurements serve the next estimate; what is late more often than it was taken to be makes P wrong",
 )

@@ -90,6 +90,10 @@ class Design:
 
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
+        design_files.write(path, self.packed())
+
+    def packed(self) -> bytes:
+        """What such an archive holds."""
         problem = self.problem
         arrays: dict[str, Any] = {"ids": design_files.stored_ids(self.ids), **self.gains._asdict(), "ny": problem.ny}
         arrays |= {
@@ -98,12 +102,17 @@ class Design:
         arrays |= {"plant_C": np.vstack(problem.C), "plant_D": problem.stacked_D}
         arrays |= {name: getattr(self, name) for name in FIELDS}
         arrays |= {name: value for name in OPTIONAL if (value := getattr(self, name)) is not None}
-        design_files.save(path, METHOD, self.fingerprint, arrays)
+        return design_files.packed(METHOD, self.fingerprint, arrays)
 
     @classmethod
     def load(cls, path: Path, made_for: str | None = None) -> Self:
         """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
-        arrays: dict[str, Any] = design_files.load(path, METHOD, made_for)
+        return cls.unpack(design_files.read(path), made_for)
+
+    @classmethod
+    def unpack(cls, content: design_files.Content, made_for: str | None = None) -> Self:
+        """As `load`, of what is in a file."""
+        arrays: dict[str, Any] = design_files.unpack(content, METHOD, made_for)
         ends = np.cumsum(arrays["ny"]).tolist()
         rows = [slice(end - size, end) for end, size in zip(ends, arrays["ny"].tolist(), strict=True)]
         C, D = (tuple(arrays[f"plant_{name}"][at] for at in rows) for name in "CD")

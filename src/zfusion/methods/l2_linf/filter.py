@@ -14,11 +14,11 @@ cancels the neighbour out. A reading that a message says is not there is what it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.family import Family, Modes
 from zfusion.methods.gramians import lyapunov
 from zfusion.methods.l2_linf.design import METHOD, Design
@@ -89,6 +89,11 @@ class L2Linf:
     def skip(self, step: int) -> None:
         """A step without any message, not even the own measurement."""
         self._move(step, {})
+
+    def unheard(self, step: int) -> tuple[NodeId, ...]:
+        """The neighbours that the mode of the step does not have."""
+        linked = self._linked[self._modes(step)]
+        return tuple(j for j in self._neighbourhood if self._position[j] not in linked)
 
     def advance(self, stage: int, step: int, arrived: Mapping[NodeId, Fields], ledger: Ledger) -> Fields | Outcome:  # noqa: ARG002
         """The estimate of this step, and the filter's move to the next."""
@@ -164,8 +169,14 @@ class _Designer:
         return options.design(system, modes.networks, modes.transition)
 
     @staticmethod
-    def load(path: Path, options: L2LinfOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
-        return Design.load(path, options.fingerprint(system, modes.networks, modes.transition))
+    def unpack(
+        content: Content,
+        options: L2LinfOptions,
+        system: System,
+        network: Network,  # noqa: ARG004
+        modes: Modes,
+    ) -> Design:
+        return Design.unpack(content, options.fingerprint(system, modes.networks, modes.transition))
 
 
 def _check(options: L2LinfOptions, system: System, network: Network) -> None:

@@ -37,6 +37,13 @@ TOLERANCE = 1e-5
 """By how much of itself a cost may exceed its bound: what the solver's own accuracy makes of a tight one."""
 
 
+PREDICTORS = "errors are those of the one-step predictors, which do not know y(k) yet"
+
+ROBUST = (
+    "bounds hold for every system of the polytope; the worst vertex aside, all else is for the scenario's own system"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """The gains of all nodes, what was promised, and what they really do.
@@ -51,9 +58,9 @@ class Design:
     J: float
     """The weighted sum of the mean squared errors; for a polytope, the largest of its vertices."""
     mse: Array
-    """Of each node, (n,), at the first vertex."""
+    """Of each node, (n,), with the nominal plant."""
     information_limit: Array
-    """What no estimator of this structure can beat, (n,), at the first vertex."""
+    """What no estimator of this structure can beat, (n,), with the nominal plant."""
     neighbourhood_mse: Array
     """Of the Kalman predictors with the neighbourhoods' measurements, (n,)."""
     centralized_mse: float
@@ -83,7 +90,12 @@ class Design:
         nodes = {"mse": self.mse, "bound": self.node_bounds, "information_limit": self.information_limit}
         nodes |= {"neighbourhood": self.neighbourhood_mse, "own_sensor": own_sensor_mse(self.problem.nominal)}
         known = {name: values.tolist() for name, values in nodes.items() if values is not None}
-        totals: dict[str, float | str | None] = {"bound": self.bound, "true_cost": self.J}
+        cost = float(self.problem.weights @ self.mse)
+        totals: dict[str, float | str | None] = {"bound": self.bound, "true_cost": cost}
+        corners, remarks = len(self.problem.vertices), [PREDICTORS]
+        if corners > 1:
+            totals |= {"vertices": float(corners), "worst_vertex_cost": self.J}
+            remarks.append(ROBUST)
         totals |= {
             f"{name}_sum": float(self.problem.weights @ values)
             for name, values in nodes.items()
@@ -91,7 +103,7 @@ class Design:
         }
         totals |= {"centralized_mse": self.centralized_mse, "solver": self.solver or "descent only"}
         totals |= {"solver_seconds": self.solver_seconds, "descent_iterations": float(self.iterations)}
-        return Forecast(totals, known, ("errors are those of the one-step predictors, which do not know y(k) yet",))
+        return Forecast(totals, known, tuple(remarks))
 
     @property
     def fingerprint(self) -> str:
@@ -100,6 +112,10 @@ class Design:
 
     def save(self, path: Path) -> None:
         """Write it as an .npz archive; InputError where that cannot be done."""
+        design_files.write(path, self.packed())
+
+    def packed(self) -> bytes:
+        """What such an archive holds."""
         arrays: dict[str, Any] = {
             "ids": design_files.stored_ids(self.ids),
             **self.gains._asdict(),
@@ -110,12 +126,17 @@ class Design:
         for name in OPTIONAL:
             if (value := getattr(self, name)) is not None:
                 arrays[name] = value
-        design_files.save(path, METHOD, self.fingerprint, arrays)
+        return design_files.packed(METHOD, self.fingerprint, arrays)
 
     @classmethod
     def load(cls, path: Path, made_for: str | None = None) -> Self:
         """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
-        arrays: dict[str, Any] = design_files.load(path, METHOD, made_for)
+        return cls.unpack(design_files.read(path), made_for)
+
+    @classmethod
+    def unpack(cls, content: design_files.Content, made_for: str | None = None) -> Self:
+        """As `load`, of what is in a file."""
+        arrays: dict[str, Any] = design_files.unpack(content, METHOD, made_for)
         gains = Gains(arrays["F"], arrays["G"], arrays["H"])
         told = {name: arrays[name].tolist() if arrays[name].ndim == 0 else arrays[name] for name in SCALARS}
         told |= {
@@ -176,14 +197,17 @@ def make_design(
         }
         promised["solver"] = f"{designed.solved.solver}: {designed.solved.status}"
     else:
-        gains = local_predictors(problem)
+        gains = _as_observers(local_predictors(problem)) if choice.observer else local_predictors(problem)
         worst = _worst(problem, gains)
     if refine:
-        doubt = (0.0 if convex or len(problem.vertices) > 1 else DOUBT) if doubt is None else doubt
-        refined = refine_gains(problem, gains, doubt)
+        certain = convex or choice.observer or len(problem.vertices) > 1
+        doubt = (0.0 if certain else DOUBT) if doubt is None else doubt
+        refined = refine_gains(problem, gains, doubt, observer=choice.observer)
         candidate = _worst(problem, refined.gains)
         if candidate.J < worst.J:
-            gains = rescaled(problem, refined.gains, evaluate(problem, refined.gains).P)
+            gains = refined.gains
+            if not choice.observer:
+                gains = rescaled(problem, gains, evaluate(problem, gains).P)
             promised |= {"iterations": refined.iterations, "node_bounds": None}
             if len(problem.vertices) > 1:
                 promised["bound"] = None
@@ -194,7 +218,7 @@ def fingerprint(ids: tuple[NodeId, ...], problem: Problem) -> str:
     """Of a problem: what a design file must have been made for."""
     parts: list[tuple[str, object]] = [("ids", str(ids)), ("weights", problem.weights)]
     parts += [(name, getattr(problem, name)) for name in ("F", "G", "H")]
-    for plant in problem.vertices:
+    for plant in _plants(problem).values():
         parts += [("A", plant.A), ("C", plant.stacked_C), ("Q", plant.Q), ("R", plant.R)]
     return design_files.fingerprint(parts)
 
@@ -219,6 +243,11 @@ def _worst(problem: Problem, gains: Gains) -> Cost:
     return max((evaluate(problem, gains, plant) for plant in problem.vertices), key=lambda cost: cost.J)
 
 
+def _as_observers(predictors: Gains) -> Gains:
+    """Kalman predictors, whose ξ is x̂, in the coordinates of the observer type: ξ = -x̂."""
+    return Gains(predictors.F, -predictors.G, -predictors.H)
+
+
 def _check_promise(J: float, bound: float) -> None:
     if not np.isfinite(J) or bound * (1 + TOLERANCE) < J:
         raise DesignError(f"numerical trouble: the design promised a cost of at most {bound:.6g}, and it costs {J:.6g}")
@@ -228,23 +257,31 @@ def _stored(problem: Problem) -> dict[str, Any]:
     """The problem as arrays: the plants' covariances Q = B W B' and R = D V D' say all that matters of the noises."""
     arrays: dict[str, Any] = {"vertices": len(problem.vertices), "ny": problem.nominal.ny, "weights": problem.weights}
     arrays |= {f"graph_{name}": getattr(problem, name) for name in ("F", "G", "H")}
-    for v, plant in enumerate(problem.vertices):
+    for name, plant in _plants(problem).items():
         arrays |= {
-            f"plant{v}_A": plant.A,
-            f"plant{v}_C": plant.stacked_C,
-            f"plant{v}_Q": plant.Q,
-            f"plant{v}_R": plant.R,
+            f"{name}_A": plant.A,
+            f"{name}_C": plant.stacked_C,
+            f"{name}_Q": plant.Q,
+            f"{name}_R": plant.R,
         }
     return arrays
+
+
+def _plants(problem: Problem) -> dict[str, Plant]:
+    """The vertices, and the center where there is one, by the names that they have in files."""
+    plants = {f"plant{v}": plant for v, plant in enumerate(problem.vertices)}
+    return plants if problem.center is None else plants | {"center": problem.center}
 
 
 def _restored(arrays: dict[str, Any]) -> Problem:
     ends = np.cumsum(arrays["ny"]).tolist()
     rows = [slice(end - size, end) for end, size in zip(ends, arrays["ny"].tolist(), strict=True)]
-    plants = []
-    for v in range(int(arrays["vertices"])):
-        A, C, Q, R = (arrays[f"plant{v}_{name}"] for name in "ACQR")
+
+    def plant(name: str) -> Plant:
+        A, C, Q, R = (arrays[f"{name}_{matrix}"] for matrix in "ACQR")
         D = tuple(np.eye(at.stop - at.start) for at in rows)
-        plants.append(Plant(A, np.eye(len(A)), tuple(C[at] for at in rows), D, Q, tuple(R[at, at] for at in rows)))
+        return Plant(A, np.eye(len(A)), tuple(C[at] for at in rows), D, Q, tuple(R[at, at] for at in rows))
+
+    plants = tuple(plant(f"plant{v}") for v in range(int(arrays["vertices"])))
     F, G, H = (arrays[f"graph_{name}"] for name in "FGH")
-    return Problem(tuple(plants), F, G, H, arrays["weights"])
+    return Problem(plants, F, G, H, arrays["weights"], plant("center") if "center_A" in arrays else None)

@@ -12,16 +12,15 @@ estimate is unbiased from the first step on, and its covariance is known from th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 
+from zfusion.methods.design_files import Content
 from zfusion.methods.family import Family, Modes
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.methods.stationary.cost import evaluate, extended
 from zfusion.methods.stationary.design import METHOD, Design
-from zfusion.methods.stationary.mapping import problem_of
 from zfusion.methods.stationary.options import StationaryOptions
 from zfusion.methods.stationary.substitution import NodeGains, Substitution, There
 from zfusion.model.network import Network
@@ -150,13 +149,19 @@ class _Designer:
         return options.design(system, network)
 
     @staticmethod
-    def load(path: Path, options: StationaryOptions, system: System, network: Network, modes: Modes) -> Design:  # noqa: ARG004
-        return Design.load(path, options.fingerprint(system, network))
+    def unpack(
+        content: Content,
+        options: StationaryOptions,
+        system: System,
+        network: Network,
+        modes: Modes,  # noqa: ARG004
+    ) -> Design:
+        return Design.unpack(content, options.fingerprint(system, network))
 
 
 def _check(options: StationaryOptions, system: System, network: Network) -> None:
     options.choice  # noqa: B018 - raises what does not go together
-    problem_of(system, network, exchange_measurements=options.exchange_measurements)
+    options.problem(system, network)
 
 
 STATIONARY = Family(

@@ -120,8 +120,12 @@ def _normalised(problem: Problem) -> tuple[Problem, float]:
     unit = float(local.mean())
     if not unit > 0:
         return problem, 1.0
-    plants = [replace(plant, W=plant.W / unit, V=tuple(v / unit for v in plant.V)) for plant in problem.vertices]
-    return replace(problem, vertices=tuple(plants)), unit
+
+    def scaled(plant: Plant) -> Plant:
+        return replace(plant, W=plant.W / unit, V=tuple(v / unit for v in plant.V))
+
+    center = None if problem.center is None else scaled(problem.center)
+    return replace(problem, vertices=tuple(map(scaled, problem.vertices)), center=center), unit
 
 
 def _unknowns(problem: Problem, choice: Choice) -> _Unknowns:

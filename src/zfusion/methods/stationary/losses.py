@@ -6,20 +6,15 @@ blocks feel their spread:  P⁺ = Ā P Āᵀ + B̄ B̄ᵀ + blockdiag_i Σ_S p_S
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from zfusion.errors import InputError
+from zfusion.methods.arrivals import arrivals
 from zfusion.methods.stationary.cost import evaluate, extended
 from zfusion.methods.stationary.design import Design
 from zfusion.methods.stationary.substitution import Substitution
 from zfusion.model.types import Array
-
-MOST_NEIGHBOURS = 12
-"""A node with more has too many sets of arrivals to go through."""
 
 SETTLED = 1e-12
 """Change of the covariance in one step, relative to its largest entry, that counts as none."""
@@ -42,8 +37,6 @@ class UnderLoss(NamedTuple):
 
 def under_loss(design: Design, loss: float) -> UnderLoss:
     """Mean squared errors when each message is lost with probability `loss`, all independent; else InputError."""
-    if not 0 <= loss <= 1:
-        raise InputError(f"expected a loss probability from 0 to 1: {loss}")
     problem, plant = design.problem, design.problem.nominal
     nominal = evaluate(problem, design.gains).P
     nodes = [_Node(Substitution(problem, design.gains, nominal, i), loss) for i in range(plant.n)]
@@ -75,10 +68,8 @@ class _Node:
         self._substitution = substitution
         neighbours = [j for j in range(substitution.problem.nominal.n) if substitution.problem.F[substitution.i, j]]
         others = [j for j in neighbours if j != substitution.i]
-        if len(others) > MOST_NEIGHBOURS:
-            raise InputError(f"a node with {len(others)} neighbours: at most {MOST_NEIGHBOURS} can be gone through")
         self._sets = []
-        for arrived, chance in _arrivals(others, loss):
+        for arrived, chance in arrivals(others, loss):
             there = tuple(sorted((substitution.i, *arrived)))
             seen = tuple(j for j in there if j in substitution.sensors)
             self._sets.append((substitution.of((there, seen)), chance))
@@ -121,12 +112,3 @@ class _Node:
         for gains, chance in self._sets:
             total += chance * self._substitution.error_covariance(gains, joint)
         return total
-
-
-def _arrivals(others: list[int], loss: float) -> Iterator[tuple[tuple[int, ...], float]]:
-    """All sets of neighbours whose message arrives, and their probabilities; impossible ones left out."""
-    for count in range(len(others) + 1):
-        chance = (1 - loss) ** count * loss ** (len(others) - count)
-        if chance > 0:
-            for arrived in combinations(others, count):
-                yield arrived, chance

@@ -99,7 +99,8 @@ class Problem:
     """A plant, or the vertices of a polytope of plants, and the graph; refuses what cannot be designed for.
 
     `F`, `G`, `H`: (n, n), True where node i (row) may use j's ξ for its own, j's measurement, j's ξ for its estimate.
-    The sum that is minimised weighs node i with `weights[i]` > 0.
+    The sum that is minimised weighs node i with `weights[i]` > 0. `center` is the plant of the polytope that the nodes
+    believe in; by default the first vertex.
     """
 
     vertices: tuple[Plant, ...]
@@ -107,17 +108,18 @@ class Problem:
     G: Mask
     H: Mask
     weights: Array
+    center: Plant | None = None
 
     def __post_init__(self) -> None:
         if not self.vertices:
             raise ModelError("vertices", self.vertices, "expected at least one plant")
         first = self.vertices[0]
-        for v, plant in enumerate(self.vertices):
+        named = [(f", vertex {v}" if len(self.vertices) > 1 else "", plant) for v, plant in enumerate(self.vertices)]
+        for where, plant in named if self.center is None else [("", self.center), *named]:
             if (plant.nx, plant.ny) != (first.nx, first.ny):
-                raise ModelError(f"vertices[{v}]", (plant.nx, plant.ny), f"expected the sizes {(first.nx, first.ny)}")
+                raise ModelError(f"plants{where}", (plant.nx, plant.ny), f"expected the sizes {(first.nx, first.ny)}")
             radius = spectral_radius(plant.A)
             if radius >= 1:
-                where = f", vertex {v}" if len(self.vertices) > 1 else ""
                 raise DesignError(f"A is not asymptotically stable (spectral radius {radius:.6g}{where})")
         for name in ("F", "G", "H"):
             object.__setattr__(self, name, _mask(name, getattr(self, name), first.n))
@@ -134,18 +136,19 @@ class Problem:
         *,
         exchange_measurements: bool = True,
         weights: ArrayLike = (),
+        center: Plant | None = None,
     ) -> Problem:
         """With one graph, γ_ij = 1 where i receives from j; without exchange of measurements G is block diagonal."""
         plants = (vertices,) if isinstance(vertices, Plant) else tuple(vertices)
         mask = _mask("graph", graph, plants[0].n if plants else 0)
         measured = mask if exchange_measurements else np.eye(len(mask), dtype=bool)
         given = np.asarray(weights, dtype=np.float64)
-        return cls(plants, mask, measured, mask, given if given.size else np.ones(len(mask)))
+        return cls(plants, mask, measured, mask, given if given.size else np.ones(len(mask)), center)
 
     @property
     def nominal(self) -> Plant:
-        """The first vertex."""
-        return self.vertices[0]
+        """What the nodes believe in: the center of a polytope that has one, else the first vertex."""
+        return self.vertices[0] if self.center is None else self.center
 
     @property
     def size(self) -> int:

@@ -1,5 +1,7 @@
 """Beyond the convex designs: descent on the true cost from any stable start, over the free entries of F and G.
 
+Estimators of the observer type stay of that type: what is free of them is G and the F between nodes.
+
 For one plant H is eliminated (`best_output`), and by the envelope theorem the gradients at that H are those of what
 is left. For a polytope H is free too, and the soft maximum of the vertices' costs is minimised: no certificate for
 the plants between the vertices, but closer to the worst case than any.
@@ -7,6 +9,7 @@ the plants between the vertices, but closer to the worst case than any.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,16 +46,20 @@ class Refined(NamedTuple):
     """Why it ended, in the words of the minimiser."""
 
 
-def refine(problem: Problem, start: Gains, doubt: float = 0.0) -> Refined:
+def refine(problem: Problem, start: Gains, doubt: float = 0.0, *, observer: bool = False) -> Refined:
     """Descend from `start`, which must be stable; see the module `doubt` for what that is.
 
-    InputError where scipy is not installed, and for a doubt on a polytope; DesignError where the start is not stable
-    under the doubt.
+    With `observer` it stays of that type: `start` must be, for one plant. InputError where scipy is not installed, and
+    for a doubt on a polytope or of an observer; DesignError where the start is not stable under the doubt.
     """
     if doubt and len(problem.vertices) > 1:
         raise InputError("stationary: a descent with doubt is for one plant, not for a polytope")
+    if doubt and observer:
+        raise InputError("stationary: a descent with doubt is not for the observer type")
     search: _Nominal
-    if doubt:
+    if observer:
+        search = _Observer(problem, start)
+    elif doubt:
         search = _WithDoubt(problem, start, doubt)
     else:
         search = _Polytope(problem, start) if len(problem.vertices) > 1 else _Nominal(problem, start)
@@ -95,6 +102,40 @@ class _Nominal:
         F[self._free.F] = entries[: self._size]
         G[self._free.G] = entries[self._size : self._size + int(self._free.G.sum())]
         return F, G
+
+
+class _Observer(_Nominal):
+    """The same of estimators that are unbiased whatever x does: F E - G C = E A, H = -I, so F_ii follows from the rest.
+
+    F_ii = A + Σ_j G_ij C_j - Σ_{j≠i} F_ij
+    """
+
+    def __init__(self, problem: Problem, start: Gains) -> None:
+        super().__init__(problem, start)
+        n, nx = problem.nominal.n, problem.nominal.nx
+        self._own = np.kron(np.eye(n), np.ones((nx, nx))).astype(bool)
+        self._free = replace(self._free, F=self._free.F & ~self._own)
+        self._size = int(self._free.F.sum())
+
+    def unpack(self, entries: Array) -> Gains:
+        """The gains with these free entries."""
+        return Gains(*self._dynamics(entries), -np.eye(self._problem.size))
+
+    def cost(self, entries: Array) -> tuple[float, Array]:
+        """J and its derivatives: what moves F_ij or G_ij moves F_ii, too."""
+        gains, plant = self.unpack(entries), self._problem.nominal
+        if not _is_stable(gains.F):
+            return NO_COST, np.zeros_like(entries)
+        J, slope = gradients(self._problem, plant, gains, _covariance(plant, gains.F, gains.G))
+        own = np.where(self._own, slope.F, 0.0) @ self._problem.E
+        dF = slope.F - own @ self._problem.E.T
+        return J, self.pack(Gains(dF, slope.G + own @ plant.stacked_C.T, slope.H))
+
+    def _dynamics(self, entries: Array) -> tuple[Array, Array]:
+        F, G = super()._dynamics(entries)
+        problem, plant = self._problem, self._problem.nominal
+        own = problem.E @ plant.A + G @ plant.stacked_C - F @ problem.E
+        return F + np.where(self._own, own @ problem.E.T, 0.0), G
 
 
 class _WithDoubt(_Nominal):
