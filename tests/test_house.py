@@ -39,6 +39,7 @@ ONLY = {
     "jinja2": ("report/page.py",),
     "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
+    "yaml": ("deploy/compose.py",),
     "cryptography": ("deploy/authority.py",),
     "pydantic": ("deploy/hosts.py", "model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
     "prometheus_client": ("report/exporters.py",),

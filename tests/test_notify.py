@@ -151,6 +151,7 @@ def test_a_node_tells_systemd_and_the_probe(tmp_path: Path, monkeypatch: pytest.
             node.process.send_signal(signal.SIGCONT)
             wait_until(lambda: Health.read(file).age_s < 1.0, "it goes on")
             node.process.send_signal(signal.SIGTERM)
+            wait_until(lambda: systemd.said("STOPPING=1"), "stopping")
             result = node.wait()
         assert result.code == 0, result.err
         assert result.summary["completed"] > 0

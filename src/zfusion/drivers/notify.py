@@ -37,6 +37,9 @@ HEALTH_FILE = "ZFUSION_HEALTH_FILE"
 BEAT_S = 2.0
 """How often the health file is written at least."""
 
+SEND_S = 1.0
+"""How long systemd may take to make room for a datagram; a few hundred fit."""
+
 SAY_NS = 1_000_000_000
 """How often the step is told: people look at it."""
 
@@ -170,7 +173,7 @@ class Supervisor:
         try:
             if self._address is not None:
                 with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-                    sender.setblocking(False)
+                    sender.settimeout(SEND_S)
                     sender.sendto(words.encode(), self._address)
             if self._file is not None:
                 self._write(self._file)
