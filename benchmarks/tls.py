@@ -9,7 +9,6 @@ steps counts, of the repetitions the median.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -22,6 +21,7 @@ import tomli_w
 from rich.console import Console
 from rich.table import Table
 
+from rounds import options_of
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
@@ -82,21 +82,17 @@ def measure(repeat: int, steps: int) -> dict[str, Found]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=4000)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    before = os.getloadavg()[0]
+    options = options_of(__doc__)
+    load = os.getloadavg()[0]
     found = measure(options.repeat, options.steps)
     if options.json:
-        sys.stdout.write(json.dumps({"cpus": os.cpu_count(), "load_before": before, "cases": found}) + "\n")
+        sys.stdout.write(json.dumps({"cpus": os.cpu_count(), "load_before": load, "cases": found}) + "\n")
         return
-    table = Table(title=f"{os.cpu_count()} CPUs, load before {before:.2f}, median of {options.repeat}")
-    for name in ("links", "rounds/s", "CPU µs a node and round"):
-        table.add_column(name, justify="left" if name == "links" else "right")
+    table = Table(
+        "links", "rounds/s", "CPU µs a node and round", title=f"{os.cpu_count()} CPUs, load before {load:.2f}"
+    )
     for name, numbers in found.items():
-        table.add_row(name, f"{numbers['rounds_per_s']:.0f}", f"{numbers['cpu_us']:.0f}")
+        table.add_row(name, *(f"{number:.0f}" for number in numbers.values()))
     Console(width=100).print(table)
 
 

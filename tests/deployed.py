@@ -14,7 +14,7 @@ import tomli_w
 import zenoh
 
 from namespaces import Hosts
-from swarms import Command, run_name, variant
+from swarms import ZFUSION, Command, run_name, variant
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan, Process
@@ -92,11 +92,16 @@ class Swarm:
         """`out` has the hosts' folders; `hosts` are those that they are on."""
         self.plan, self.out = plan, out
         self.commands: dict[str, Command] = {}
+        self._hosts = hosts
         for one in plan.processes:
             if one.kind in {"node", "recorder", "router"}:
-                words = [*plan.command(one)[1:], *(["--json"] if one.kind != "router" else [])]
-                entrance = () if hosts is None else hosts.entrance(one.host)
-                self.commands[one.name] = Command(out / one.host, *words, entrance=entrance)
+                self.start(one)
+
+    def start(self, one: Process) -> None:
+        """Start a process, or start it again."""
+        words = [*self.plan.command(one)[1:], *(["--json"] if one.kind != "router" else [])]
+        entrance = () if self._hosts is None else self._hosts.entrance(one.host)
+        self.commands[one.name] = Command(self.out / one.host, *words, program=(*entrance, *ZFUSION))
 
     def steps_taken(self) -> bool:
         """Whether messages are on the recording."""

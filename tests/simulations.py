@@ -14,7 +14,7 @@ from zfusion.links import Edge, Link
 from zfusion.messages import decode_any, encode_any
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import NodeId
-from zfusion.recording import Record, Recording, RecordingWriter
+from zfusion.recording import Keeping, Record, Recording, RecordingWriter
 from zfusion.stages import Message
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "four_sensor.toml"
@@ -87,10 +87,11 @@ def record_story(
     return simulation
 
 
-def writer_for(path: Path, scenario: Scenario) -> RecordingWriter:
+def writer_for(path: Path, scenario: Scenario, keeping: Keeping | None = None) -> RecordingWriter:
     """A recording of run "r", to be written to."""
     toml = scenario.anchored().to_toml()
-    return RecordingWriter(path, scenario_toml=toml, run="r", method=scenario.method.name, seed=scenario.seed)
+    facts = {"run": "r", "method": scenario.method.name}
+    return RecordingWriter(path, scenario_toml=toml, seed=scenario.seed, keeping=keeping, **facts)
 
 
 def records(path: Path) -> list[Record]:

@@ -89,14 +89,17 @@ class Result:
 class Command:
     """A zfusion command that runs, in a directory of its own making."""
 
-    def __init__(self, directory: Path, *words: object, entrance: Sequence[str] = ()) -> None:
-        """`entrance` has the words before it that have it run somewhere else."""
+    def __init__(
+        self, directory: Path, *words: object, program: Sequence[object] = ZFUSION, limit_bytes: int | None = None
+    ) -> None:
+        """`limit_bytes` is how large a file it may write, as on a full disk."""
         number = next(_numbers)
         self._out, self._err = (directory / f"command{number}.{name}" for name in ("out", "err"))
         environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
+        limit = [] if limit_bytes is None else ["prlimit", f"--fsize={limit_bytes}"]
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [*MORTAL, *entrance, *ZFUSION, *map(str, words)],
+                [*MORTAL, *limit, *map(str, program), *map(str, words)],
                 cwd=directory,
                 stdout=out,
                 stderr=err,

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from deployed import SPREAD, deployed, swarm
+from deployed import SPREAD, deployed, hosts_document, process, swarm
 from namespaces import hosts, why_none
-from swarms import recorded, run_name, zfusion
+from swarms import estimates, recorded, run_name, wait_until, zfusion
 
 TROUBLE = why_none()
 
@@ -47,3 +47,23 @@ def test_each_host_with_nothing_but_its_folder(tmp_path: Path, topology: str) ->
     assert {m.topic.split("/")[3] for m in recorded(running.recording) if "/node/" in m.topic} == {"1", "2", "3", "4"}
     verdict = zfusion(tmp_path, "replay", running.recording, "--verify", "--json")
     assert verdict.code == 0, verdict.err
+
+
+@pytest.mark.long
+def test_a_router_that_is_killed_and_started_again(tmp_path: Path) -> None:
+    """Nobody ends for it, and all find each other again; what was lost meanwhile is told."""
+    plan = deployed(tmp_path, hosts_document("router"), steps=100_000, timing={"rate_hz": 20.0})
+    with swarm(plan, tmp_path / "out") as running:
+        wait_until(running.steps_taken, "steps are taken")
+        said = running.commands["recorder"].said
+        running.commands["router-a"].process.kill()
+        running.commands["router-a"].process.wait()
+        wait_until(lambda: all(f"node {i} is gone" in said() for i in "1234"), "the recorder sees nobody")
+        running.start(process(plan, "router-a"))
+        recorded_then = running.recording.stat().st_size
+        wait_until(lambda: running.recording.stat().st_size > recorded_then + 40_000, "it is recorded again")
+        running.interrupt()
+        reports = running.ended()
+    last = {i: used for (i, _), (*_, used, _) in sorted(estimates(running.recording).items())}
+    assert last == {i: list(plan.scenario.network.neighbours(i)) for i in plan.scenario.ids}
+    assert sum(reports["recorder"]["lost"].values()) > 0

@@ -24,6 +24,7 @@ LAYERS = (
     ("drivers",),
     ("swarm",),
     ("deploy",),
+    ("doctor",),
     ("studies",),
     ("report",),
     ("cli",),
@@ -40,17 +41,18 @@ ONLY = {
     "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
     "yaml": ("deploy/compose.py",),
-    "cryptography": ("deploy/authority.py",),
-    "pydantic": ("deploy/hosts.py", "model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
     "prometheus_client": ("report/exporters.py",),
     "opentelemetry": ("report/exporters.py",),
+    "psutil": ("swarm/watch.py",),
+    "cryptography": ("deploy/authority.py",),
+    "pydantic": ("deploy/hosts.py", "model/schema/", "model/scenario.py", "studies/experiment/spec.py"),
     "distributed": ("studies/experiment/engines.py",),
     "cvxpy": ("methods/convex.py",),
     "scipy": ("methods/convex.py",),
 }
 """Packages, and the only places that import them."""
 
-ZENOH_MODULES = {"key_source", "transport", "inbox", "presence", "recorder", "player", "observer"}
+ZENOH_MODULES = {"inquiry", "key_source", "transport", "inbox", "presence", "recorder", "player", "observer"}
 
 NO_CLOCK = ("model/", "methods/", "node.py", "used_sets.py", "messages.py", "stages.py", "keys.py", "gaps.py", "links/")
 

@@ -36,6 +36,8 @@ WARY = ("consensus", "diffusion", "kalman_consensus", "hybrid_consensus", "covar
 HUGE = np.array([1e300, -1e300])
 
 CASES: list[tuple[str, int, dict[str, Any]]] = [
+    ("two_stage", 0, {"y": np.array([1e300])}),
+    ("centralized", 0, {"y": np.array([-1e300])}),
     ("consensus", 0, {"x": HUGE}),
     ("consensus", 1, {"M": np.array([1e300, 0, 1e300])}),
     ("diffusion", 0, {"y": np.array([1e300])}),

@@ -99,7 +99,7 @@ def test_what_is_decoded_encodes_to_the_same_map(stage: Stage) -> None:
     message = decoder(stage).decode(msgpack.packb(payload(stage)))
     assert (message.step, message.stage, message.seq, message.born, message.t_ns) == (9, stage.name, 7, 3, 10**18)
     assert decode_any(encode(message)) == payload(stage)
-    assert read_stamp(encode(message)) == (3, 7, 10**18)
+    assert read_stamp(encode(message)) == (3, 7, 10**18, message.step)
 
 
 def test_decoded_values_have_the_types_of_their_kinds() -> None:

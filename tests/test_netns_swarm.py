@@ -12,10 +12,9 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import numpy as np
 import pytest
 import tomli_w
 
+from namespaces import in_a_thread_of_its_own
 from swarms import (
     EXAMPLE,
     PATIENCE_S,
@@ -41,7 +41,6 @@ from swarms import (
 )
 from zfusion.drivers.rerun import rerun
 from zfusion.drivers.simulated import simulate
-from zfusion.errors import InputError
 from zfusion.links import MeasuredLinks
 from zfusion.model.scenario import load_scenario
 from zfusion.recording import Recording
@@ -52,24 +51,6 @@ from zfusion.swarm.netns.wires import wire_up
 
 NODES = ["1", "2", "3", "4"]
 MS = 1_000_000
-
-Outcome = list[Any]
-
-
-def in_a_thread_of_its_own(function: Callable[[], Any]) -> Any:
-    """What a function returns that may change the namespace of the thread that it runs in; or its exception."""
-    outcome: Outcome = []
-
-    def call() -> None:
-        try:
-            outcome.append(function())
-        except (OSError, InputError) as error:
-            outcome.append(error)
-
-    thread = threading.Thread(target=call)
-    thread.start()
-    thread.join()
-    return outcome[0]
 
 
 def make_one() -> None:

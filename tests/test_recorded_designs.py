@@ -19,7 +19,7 @@ from zfusion.errors import InputError
 from zfusion.methods.design_files import DesignFileError
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.recording import Recording
-from zfusion.studies.method_comparison import field_of_recording
+from zfusion.studies.contestants import field_of_recording
 
 pytest.importorskip("cvxpy")
 

@@ -14,6 +14,8 @@ import zenoh
 
 from swarms import EXAMPLE, wait_until
 from zfusion import keys
+from zfusion.drivers import inbox as inbox_module
+from zfusion.drivers import recorder as recorder_module
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.recorder import Recorder
@@ -83,6 +85,10 @@ class Studio:
         self._thread.join(30)
         assert not self._thread.is_alive()
         self.peer.close()
+
+
+def recording_as(scenario: Scenario, **settings: object) -> Scenario:
+    return scenario.model_copy(update={"recording": scenario.recording.model_copy(update=settings)})
 
 
 @pytest.fixture
@@ -157,8 +163,7 @@ def test_what_is_not_of_the_scenario_is_counted_and_not_recorded(studio: Studio)
 
 
 def test_a_flush_is_on_the_disk_while_the_run_goes_on(tmp_path: Path, scenario: Scenario) -> None:
-    quick = scenario.model_copy(update={"recording": scenario.recording.model_copy(update={"flush_interval_s": 0.05})})
-    studio = Studio(tmp_path / "q.mcap", quick)
+    studio = Studio(tmp_path / "q.mcap", recording_as(scenario, flush_interval_s=0.05))
     try:
         studio.measurement(1, 0)
         assert studio.ask() == 1
@@ -177,23 +182,79 @@ def test_by_itself_it_ends_when_everybody_has_come_and_gone(tmp_path: Path, scen
     tokens = [liveliness.declare_token(keys.node_token(RUN, i)) for i in (*scenario.ids, 99)]
     studio.measurement(1, 0)
     assert studio.ask() == 1
+    for i in scenario.ids:
+        studio.event(i)
     for token in tokens[:-2]:
         token.undeclare()
-    assert studio.ask() == 1  # node 4 is still there
+    assert studio.ask() == 1 + len(scenario.ids)  # node 4 is still there
     tokens[-2].undeclare()
     studio.join()
     assert studio.report is not None
-    assert studio.report.messages == 1
+    assert studio.report.messages == 1 + len(scenario.ids)
 
 
-def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path, scenario: Scenario) -> None:
-    studio = Studio(tmp_path / "f.mcap", scenario)
+def test_a_full_disk_ends_the_recording_and_the_recorder_goes_on_counting(studio: Studio) -> None:
+    for number in range(10):
+        studio.measurement(1, number)
+    assert studio.ask() == 10
+    studio.writer.flush()
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    studio.writer._writer.add_message = full  # type: ignore[method-assign]
-    studio.measurement(1, 0)
+    studio.writer._segment.add = full  # type: ignore[method-assign]
+    for number in range(10, 15):
+        studio.measurement(1, number)
+    studio.measurement(2, 0)
+    assert studio.ask() == 10
+    report = studio.finish()
+    assert (report.messages, report.unrecorded) == (10, 6)
+    assert "No space left on device" in report.stopped
+    assert report.lost == {keys.stage_key(RUN, 1, "measurement"): 5, keys.stage_key(RUN, 2, "measurement"): 1}
+    with Recording.open(studio.path) as recording:
+        assert not recording.complete
+        assert [record.sequence for record in recording.records()] == list(range(10))
+
+
+def test_what_a_slow_disk_leaves_no_room_for_is_dropped_and_counted_and_nobody_waits(
+    tmp_path: Path, scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox_module, "POSTED", 50)
+    studio = Studio(tmp_path / "s.mcap", recording_as(scenario, when_full="drop"))
+    going, write = threading.Event(), studio.writer.write
+    studio.writer.write = lambda *message: (going.wait(60), write(*message))[1]  # type: ignore[method-assign]
+    try:
+        for number in range(1000):
+            studio.measurement(1, number)  # would wait if the recorder held it up: far more than fits on the way
+        wait_until(lambda: studio.recorder._inbox.overrun == 1000 - 1 - 50, "all but one and what waits is dropped")
+    finally:
+        going.set()
+    assert studio.ask() == 51
+    studio.event(1, sent={"measurement": 1000})
+    assert studio.ask() == 52
+    report = studio.finish()
+    assert report.overrun == 1000 - report.by_key["1/measurement"] == report.lost[keys.stage_key(RUN, 1, "measurement")]
+    assert report.overrun == 949
+    with Recording.open(studio.path) as recording:
+        assert recording.closing["overrun"] == str(report.overrun)
+
+
+def test_nodes_that_vanished_without_a_word_may_come_back(
+    tmp_path: Path, scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder that stood still for long finds all its links broken: that is not the end of the run."""
+    monkeypatch.setattr(recorder_module, "GRACE_NS", 10**18)
+    studio = Studio(tmp_path / "b.mcap", scenario, until_all_gone=True)
+    liveliness = studio.peer.liveliness()
+    for _ in range(2):
+        tokens = [liveliness.declare_token(keys.node_token(RUN, i)) for i in scenario.ids]
+        studio.measurement(1, 0)
+        studio.ask()
+        for token in tokens:
+            token.undeclare()
+    assert studio.ask() == 2
+    for i in scenario.ids:
+        studio.event(i)
     studio.join()
-    assert studio.error is not None
-    assert "No space left on device" in str(studio.error)
+    assert studio.report is not None
+    assert studio.report.messages == 2 + len(scenario.ids)

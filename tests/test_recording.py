@@ -24,67 +24,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from recordings import SCENARIO_TOML, START_NS, contents, open_writer, read, record, traffic
 from zfusion import gaps as gaps_module
 from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
-from zfusion.recording import GapCounter, Gaps, Record, Recording, RecordingWriter, arithmetic_differences
-from zfusion.recording import writer as writer_module
+from zfusion.recording import GapCounter, Gaps, Record, Recording, arithmetic_differences, layout
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info
 from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed
 from zfusion.recording.provenance import machine, software
 from zfusion.stages import TRUTH_SENDER, Field, Kind, Message, Stage
 
-START_NS = 1_790_000_000_000_000_000
-SCENARIO_TOML = 'name = "test"  # é\n'
-
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-
-Sent = list[tuple[str, bytes, int]]
-"""(topic, payload, arrival)"""
-
-
-def traffic(steps: int, nodes: tuple[int, ...] = (1, 2)) -> Sent:
-    """What two nodes and the truth put on their keys, and when it came, 7 us after it was sent."""
-    random = np.random.default_rng(5)
-    sent: Sent = []
-    for step in range(1, steps + 1):
-        at = START_NS + step * 1_000_000
-        truth = Message(TRUTH_SENDER, step, "truth", step - 1, 1, at, {"x": random.normal(size=2)})
-        sent.append((keys.truth_key("r"), encode(truth), at + 7_000))
-        for node in nodes:
-            contents: dict[str, dict[str, object]] = {
-                "measurement": {"y": random.normal(size=1) if step % 3 else None},
-                "estimate": {"x": random.normal(size=2), "P": random.normal(size=(2, 2)), "used": (1,), "excluded": ()},
-            }
-            for stage, fields in contents.items():
-                message = Message(node, step, stage, step - 1, 1, at, fields)
-                sent.append((keys.stage_key("r", node, stage), encode(message), at + 7_000))
-    return sent
-
-
-def open_writer(path: Path, **more: Any) -> RecordingWriter:
-    return RecordingWriter(path, scenario_toml=SCENARIO_TOML, run="r", method="two_stage", seed=7, **more)
-
-
-def record(path: Path, sent: Sent, flush_every: int = 10**9, **more: Any) -> Path:
-    with open_writer(path, **more) as writer:
-        for number, message in enumerate(sent):
-            writer.write(*message)
-            if number % flush_every == flush_every - 1:
-                writer.flush()
-    return path
-
-
-def contents(recording: Recording) -> Sent:
-    return [(r.topic, r.data, r.log_time_ns) for r in recording.records()]
-
-
-def read(path: Path) -> Sent:
-    with Recording.open(path) as recording:
-        return contents(recording)
-
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+}
 
 # --- what is on the file ----------------------------------------------------------------------------------------
 
@@ -111,7 +65,7 @@ def test_the_plain_mcap_reader_finds_everything(tmp_path: Path) -> None:
     assert (facts["format"], facts["run"], facts["method"], facts["seed"]) == ("1", "r", "two_stage", "7")
     assert facts.items() >= (software() | machine()).items()
     assert {"clock_realtime_ns", "clock_monotonic_ns"} <= facts.keys()
-    assert set(metadata["zfusion.stats"]) == {topic for topic, _, _ in sent}
+    assert set(metadata["zfusion.stats"]) == {CHECKSUM} | {topic for topic, _, _ in sent}
     assert metadata["zfusion.close"]["messages"] == str(len(sent))
 
 
@@ -211,7 +165,7 @@ def test_finishing_twice_is_finishing_once(tmp_path: Path) -> None:
 
 
 def test_a_file_holds_so_many_topics_and_counts_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writer_module, "MAX_TOPICS", 2)
+    monkeypatch.setattr(layout, "MAX_TOPICS", 2)
     sent = [(f"zfusion/r/node/{n}/estimate", b"\x80", 1) for n in (1, 2, 3, 2)]
     with Recording.open(record(tmp_path / "r.mcap", sent)) as recording:
         assert [r.topic[-10] for r in recording.records()] == ["1", "2", "2"]
@@ -239,7 +193,7 @@ def test_a_disk_that_fills_up_costs_what_came_after(tmp_path: Path) -> None:
 
 FULL = """
 import resource, signal, sys
-from test_recording import open_writer, traffic
+from recordings import open_writer, traffic
 from zfusion.errors import RunError
 from pathlib import Path
 
@@ -268,7 +222,7 @@ except RunError as error:
 
 KILLED = """
 import sys
-from test_recording import open_writer, traffic
+from recordings import open_writer, traffic
 from pathlib import Path
 
 writer = open_writer(Path(sys.argv[1]))
@@ -404,7 +358,7 @@ def test_a_flipped_byte_in_a_recording_that_was_broken_off(tmp_path: Path) -> No
 def test_a_wiped_block_is_found_when_the_file_is_opened(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", traffic(200))
     data = bytearray(path.read_bytes())
-    data[5000:5100] = bytes(100)
+    data[15000:15100] = bytes(100)
     path.write_bytes(data)
     with pytest.raises(RecordingError, match=r"damaged at byte \d+: the checksum of the data section does not agree"):
         Recording.open(path)
@@ -414,7 +368,7 @@ def test_damage_that_comes_after_opening(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", traffic(200))
     with Recording.open(path) as recording:
         with path.open("r+b") as file:
-            file.seek(5000)
+            file.seek(15000)
             file.write(bytes(100))
         with pytest.raises(RecordingError, match=r"r\.mcap: damaged at byte"):
             list(recording.records())
@@ -452,8 +406,8 @@ OURS = {"format": "1", "run": "r", "method": "m", "seed": ""}
         (lambda path: path.write_bytes(b"\x89MCAP0\r\n"), "ends at byte 8, before it says what it is"),
         (foreign, "not a recording of zfusion's"),
         (lambda path: foreign(path, sealed(OURS | {"format": "2"})), "is a recording of format 2; this zfusion reads"),
-        (lambda path: foreign(path, OURS | {CHECKSUM: "0"}), "checksum of its zfusion.recording"),
-        (lambda path: foreign(path, OURS), "checksum of its zfusion.recording"),
+        (lambda path: foreign(path, OURS | {CHECKSUM: "0"}), "checksum of a zfusion.recording"),
+        (lambda path: foreign(path, OURS), "checksum of a zfusion.recording"),
         (lambda path: foreign(path, sealed(OURS), scenario=b""), "has no scenario.toml"),
         (lambda path: foreign(path, sealed(OURS), scenario=b"\xff"), "'utf-8' codec can't decode"),
         (lambda path: foreign(path, sealed(OURS), use_chunking=False), "a record of type 5 among the data"),

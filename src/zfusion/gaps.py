@@ -18,6 +18,10 @@ MAX_HOLES = 4096
 """Separate holes remembered in one life, for messages that come late; the oldest are given up for lost beyond that."""
 
 
+LIVES_WITH_HOLES = 4
+"""Last lives of a sender of which holes are remembered: of those before, nothing that is late comes any more."""
+
+
 @dataclass(frozen=True, slots=True)
 class Gaps:
     """The account of one key: of what the sender put on it, what came and what did not."""
@@ -58,6 +62,8 @@ class _Life:
     reordered: int = 0
     given_up: int = 0
     """Numbers missing in holes that are no longer remembered."""
+    given_up_before: int = 0
+    """Of these, those before the lowest that came."""
     holes: list[tuple[int, int]] = field(default_factory=list)
     """[start, stop) of the missing numbers below `next`, ascending."""
 
@@ -81,8 +87,13 @@ class _Life:
 
     def missing(self) -> tuple[int, int]:
         """Numbers missing before the lowest that came, and between it and the highest."""
-        before = sum(stop - start for start, stop in self.holes if stop <= self.lowest)
+        before = self.given_up_before + sum(stop - start for start, stop in self.holes if stop <= self.lowest)
         return before, self.given_up + sum(stop - start for start, stop in self.holes) - before
+
+    def give_up(self) -> None:
+        """Remember how many numbers are missing, and not which."""
+        before, between = self.missing()
+        self.given_up_before, self.given_up, self.holes = before, before + between, []
 
     def _fill(self, seq: int) -> bool:
         """Take `seq` out of its hole; False if it is in none."""
@@ -152,5 +163,7 @@ class GapCounter:
             if len(self._lives) == MAX_LIVES:
                 return False
             self._lives[born] = _Life()
+            for former in list(self._lives.values())[-LIVES_WITH_HOLES - 1 : -LIVES_WITH_HOLES]:
+                former.give_up()
         self._born, self._life = born, self._lives[born]
         return True

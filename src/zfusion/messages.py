@@ -103,6 +103,7 @@ class Stamp(NamedTuple):
     born: int
     seq: int
     t_ns: int
+    step: int
 
 
 def encode(message: Message, sent_ns: int | None = None) -> bytes:
@@ -184,7 +185,7 @@ def read_stamp(data: bytes) -> Stamp:
     except KeyError as missing:
         raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
     _check_counters(step, seq, born, t_ns)
-    return Stamp(born, seq, t_ns)
+    return Stamp(born, seq, t_ns, step)
 
 
 def decode_any(data: bytes) -> dict[str, Any]:

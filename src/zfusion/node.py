@@ -262,7 +262,7 @@ class Node:
         """
         own = self.ledger.of(self.id)
         assert own is not None  # the ledger begins with it
-        end = own.last - self._window
+        end = max(own.last - self._window, self.born - 1)
         return self.born, end, own.runs(end)
 
     def event(self, kind: str, now: int, **details: object) -> Message:
@@ -365,6 +365,10 @@ class Node:
     def _note_late(self, message: Message, stage: int) -> None:
         """Count what is late; if it is within the window, keep it until its stage closes again."""
         counters, step = self.counters[message.node], message.step
+        refusal = self._wary.refuses(stage, message.fields) if self._window and self._wary else None
+        if refusal is not None:
+            counters.refused[refusal] += 1
+            return
         counters.late[message.stage] += 1
         if not self._window or step < self.born or stage not in (0, len(self._stages) - 1):
             return

@@ -11,8 +11,8 @@ from math import isfinite
 from typing import Any
 
 from zfusion.errors import MessageError
-from zfusion.messages import VERSION, Reason, decode_any, encode_any
-from zfusion.model.types import NodeId
+from zfusion.messages import MAX_STEP, MAX_TIME_NS, VERSION, Reason, decode_any, encode_any
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.used_sets import Run
 
 BIN = re.compile(r"[0-9]{1,4}")
@@ -93,10 +93,18 @@ class Status:
     estimate: Mapping[str, list[float]] = field(default_factory=dict)
     """The last one, where there is one: x, and sd, the standard deviations of its errors. For people to look at."""
     machine: str | None = None
-    """Of nodes that tell the same here the clocks are one; None where nothing can be said."""
+    """Nodes that tell the same here count the same time; None where nothing can be said."""
+    line_ns: int = 0
+    """Where the node's time line begins, on that count."""
+    clock_jumps: int = 0
+    """How often its machine's clock was seen to jump."""
+    clock_offset_exceeded: int = 0
+    """Readings of neighbours' clocks that were beyond what is allowed."""
     heard_ns: int = 0
     """When the question was heard that this answers, and when the answer was told, on the node's clock."""
     told_ns: int = 0
+    holder_ns: int | None = None
+    """Start of the process that this node knows under the asker's id, where that is another than the asker."""
     counts: Counts | None = None
     """Where they were asked for."""
     zfusion: str = version("zfusion")
@@ -113,26 +121,35 @@ class Status:
 
     @classmethod
     def decode(cls, data: bytes) -> Status:
-        """From bytes; MessageError if they are no status."""
+        """From bytes; MessageError if they are no status.
+
+        Of another version's only the identity is read: the rest may be something else by then.
+        """
         raw = decode_any(data)
         try:
+            node, fingerprint = _id(raw["node"]), _typed(raw, "fingerprint", str)
+            zfusion, wire = _typed(raw, "zfusion", str), _typed(raw, "wire", int)
+            if (zfusion, wire) != (version("zfusion"), VERSION):
+                return cls(node, fingerprint, Phase.JOINING, 0, 0, None, {}, zfusion=zfusion, wire=wire)
             status = cls(
-                node=_id(raw["node"]),
-                fingerprint=_typed(raw, "fingerprint", str),
+                node=node,
+                fingerprint=fingerprint,
                 phase=Phase(_typed(raw, "phase", str)),
-                step=_typed(raw, "step", int),
-                born=_typed(raw, "born", int),
-                epoch_ns=None if raw["epoch_ns"] is None else _typed(raw, "epoch_ns", int),
-                ready={_id(i): int(start) for i, start in _typed(raw, "ready", list)},
-                completed=_typed(raw, "completed", int),
-                fallbacks=_typed(raw, "fallbacks", int),
+                step=_count(raw, "step", MAX_STEP),
+                born=_count(raw, "born", MAX_STEP),
+                epoch_ns=None if raw["epoch_ns"] is None else _count(raw, "epoch_ns"),
+                ready={_id(i): _number(start, "ready", MAX_TIME_NS) for i, start in _typed(raw, "ready", list)},
+                completed=_count(raw, "completed", MAX_STEP),
+                fallbacks=_count(raw, "fallbacks", MAX_TIME_NS),
                 estimate=_vectors(raw, "estimate"),
                 machine=None if raw["machine"] is None else _typed(raw, "machine", str),
-                heard_ns=_typed(raw, "heard_ns", int),
-                told_ns=_typed(raw, "told_ns", int),
+                line_ns=_signed(raw, "line_ns"),
+                clock_jumps=_count(raw, "clock_jumps"),
+                clock_offset_exceeded=_count(raw, "clock_offset_exceeded"),
+                heard_ns=_count(raw, "heard_ns"),
+                told_ns=_count(raw, "told_ns"),
                 counts=Counts.from_map(raw["counts"]) if raw.get("counts") is not None else None,
-                zfusion=_typed(raw, "zfusion", str),
-                wire=_typed(raw, "wire", int),
+                holder_ns=None if raw["holder_ns"] is None else _count(raw, "holder_ns"),
             )
         except KeyError as missing:
             raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
@@ -155,6 +172,12 @@ class RecorderStatus:
     """Messages that had come and were not on the file yet when the question was heard."""
     path: str
     host: str
+    unrecorded: int = 0
+    """Messages that came and could not be written."""
+    overrun: int = 0
+    """Messages that came and were dropped unread, being too much at once."""
+    stopped: str = ""
+    """Why nothing is written any more, if that is so."""
 
     def encode(self) -> bytes:
         """As bytes."""
@@ -165,8 +188,9 @@ class RecorderStatus:
         """From bytes; MessageError if they are no such status."""
         raw = decode_any(data)
         try:
-            counts = {name: _typed(raw, name, int) for name in ("messages", "foreign", "lost", "waiting")}
-            return cls(**counts, path=_typed(raw, "path", str), host=_typed(raw, "host", str))
+            counts = ("messages", "foreign", "lost", "waiting", "unrecorded", "overrun")
+            words = {name: _typed(raw, name, str) for name in ("path", "host", "stopped")}
+            return cls(**{name: _typed(raw, name, int) for name in counts}, **words)
         except KeyError as missing:
             raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
 
@@ -192,7 +216,7 @@ class HistoryAnswer:
     def from_map(cls, raw: Mapping[str, Any], legal: frozenset[NodeId]) -> HistoryAnswer:
         """From what `encode` put into a map; MessageError as `decode`."""
         try:
-            born, end, told = _typed(raw, "born", int), _typed(raw, "end", int), _typed(raw, "runs", list)
+            born, end, told = _count(raw, "born", MAX_STEP), _count(raw, "end", MAX_STEP), _typed(raw, "runs", list)
         except KeyError as missing:
             raise MessageError(Reason.MISSING_FIELD, str(missing)) from None
         runs: list[Run] = []
@@ -204,7 +228,9 @@ class HistoryAnswer:
             if not previous < first <= end:
                 raise MessageError(Reason.BAD_HISTORY, f"a run from {first} after {previous}, up to {end}")
             if not legal.issuperset(map(_id, used)):
-                raise MessageError(Reason.UNKNOWN_ID, str(used))
+                raise MessageError(Reason.UNKNOWN_ID, f"{used!r:.80}")
+            if used != sorted_ids(set(used)):
+                raise MessageError(Reason.NOT_SORTED, f"{used!r:.80}")
             runs.append((first, tuple(used)))
             previous = first
         return cls(born, end, tuple(runs))
@@ -214,6 +240,26 @@ def _id(value: object) -> NodeId:
     if type(value) is int or type(value) is str:
         return value
     raise MessageError(Reason.WRONG_TYPE, f"{value!r} is no node id")
+
+
+def _count(raw: Mapping[str, Any], name: str, most: int = MAX_TIME_NS) -> int:
+    return _number(raw[name], name, most)
+
+
+def _number(value: object, name: str, most: int) -> int:
+    if type(value) is not int:
+        raise MessageError(Reason.WRONG_TYPE, f"{name}: expected int, is {value!r:.80}")
+    if not 0 <= value <= most:
+        raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {value}")
+    return value
+
+
+def _signed(raw: Mapping[str, Any], name: str) -> int:
+    """A time of a clock that may be set to before 1970."""
+    value: int = _typed(raw, name, int)
+    if abs(value) > MAX_TIME_NS:
+        raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {value}")
+    return value
 
 
 def _typed(raw: Mapping[str, Any], name: str, expected: type) -> Any:

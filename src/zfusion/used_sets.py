@@ -7,9 +7,11 @@ neighbours can go on after messages were lost; what they still do not know is a 
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from zfusion.model.types import NodeId
 
@@ -25,6 +27,15 @@ window has steps, so that every message says all that it can have changed since 
 KEPT_RUNS = 16_384
 """Runs that a node remembers of itself and of each neighbour: some MB at the worst, and what one answer can carry."""
 
+SHARED = 4096
+"""Different used sets of which all runs share one tuple: there are few, and long histories repeat them."""
+
+
+@lru_cache(maxsize=SHARED)
+def _shared(used: UsedSet | None) -> UsedSet | None:
+    """The same used set, as the object that stands for it."""
+    return used
+
 
 @dataclass(slots=True)
 class History:
@@ -36,7 +47,7 @@ class History:
     born: int
     last: int = field(default=-1)
     """The last step of which anything is known; `born` - 1 where nothing is."""
-    _starts: list[int] = field(default_factory=list)
+    _starts: array[int] = field(default_factory=lambda: array("q"))
     _sets: list[UsedSet | None] = field(default_factory=list)
     """From each start to the next, or to `last`; None where it is not known. No two neighbours are equal."""
 
@@ -103,7 +114,7 @@ class History:
         for step, used in runs:
             if not self._sets or self._sets[-1] != used:
                 self._starts.append(step)
-                self._sets.append(used)
+                self._sets.append(_shared(used))
         excess = max(0, len(self._starts) - KEPT_RUNS)
         del self._starts[:excess], self._sets[:excess]
         self.last = max(self.last, end)
@@ -139,7 +150,7 @@ class History:
     def _append(self, step: int, used: UsedSet) -> None:
         if not self._sets or self._sets[-1] != used:
             self._starts.append(step)
-            self._sets.append(used)
+            self._sets.append(_shared(used))
             if len(self._starts) > KEPT_RUNS:
                 del self._starts[0], self._sets[0]
         self.last = step

@@ -16,6 +16,7 @@ from zfusion import __version__
 from zfusion.cli import (
     compare,
     deploy,
+    doctor,
     experiment,
     library,
     live,
@@ -23,7 +24,9 @@ from zfusion.cli import (
     models,
     observe,
     recordings,
+    repair,
     report,
+    soak,
     supervision,
 )
 from zfusion.cli.common import err, out
@@ -42,14 +45,15 @@ for command in (
     live.simulate,
     live.node,
     live.record,
-    deploy.deploy,
-    deploy.router,
     supervision.health,
     observe.status,
     observe.top,
     observe.echo,
     observe.hz,
     observe.metrics,
+    deploy.deploy,
+    deploy.router,
+    doctor.doctor,
     models.design,
     compare.compare,
     compare.worst,
@@ -57,7 +61,11 @@ for command in (
     recordings.replay,
     recordings.info,
     recordings.export,
+    repair.recover,
+    repair.merge,
+    repair.cut,
     report.report,
+    soak.soak,
 ):
     app.command()(command)
 app.command(hidden=True)(live.network)

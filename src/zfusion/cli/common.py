@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -156,6 +157,17 @@ def epoch_ns(text: str) -> int:
     return round(epoch.timestamp() * 1000) * 1_000_000
 
 
+def steps_range(text: str | None) -> range | None:
+    """``A:B``, both included, or ``A``; InputError for anything else."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", text)
+    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    if not 1 <= first <= last:
+        raise InputError(f"--steps: expected first:last, like 100:112 (is {text!r})")
+    return range(first, last + 1)
+
+
 def finish(result: Mapping[str, Any], as_json: bool, show: Callable[[], None]) -> None:
     """The result, for programs or for people."""
     if as_json:
@@ -174,10 +186,9 @@ def control_of(descriptor: int | None, *, deadly: bool) -> Any:
     """The line to the launcher, in a process that one started."""
     if descriptor is None:
         return None
-    from zfusion.swarm.control import ChildEnd, die_with_parent
+    from zfusion.swarm.control import ChildEnd, on_death_of_parent
 
-    if deadly:
-        die_with_parent()
+    on_death_of_parent(signal.SIGKILL if deadly else signal.SIGCONT)
     return ChildEnd(descriptor)
 
 

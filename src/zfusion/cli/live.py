@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -46,6 +46,11 @@ from zfusion.cli.supervision import supervised, teller
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import NodeId
+
+if TYPE_CHECKING:
+    from zfusion.swarm.launch import Child, Launcher
+
+    WatchedBy = Callable[[Launcher, Mapping[NodeId, Child], Child | None], None]
 
 NetnsKind = Literal["tun", "netem"]
 
@@ -93,18 +98,32 @@ def launched(
     restart: bool = False,
     netns: str | None = None,
     quiet: bool = False,
+    directory: Path | None = None,
+    watch: WatchedBy | None = None,
+    health_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Launch a swarm, show how it goes unless `quiet`, and summarise it."""
+    """Launch a swarm, show how it goes unless `quiet`, and summarise it.
+
+    The logs go to `directory`, by default where the recording does. `watch` is called about ten times a second with the
+    launcher and its processes, of which the nodes tell their health every `health_s`.
+    """
     from zfusion.report.summary import summarize
     from zfusion.report.table import LiveTable
     from zfusion.swarm.launch import Launcher, LaunchOptions
 
-    directory = recording.parent if recording is not None else default_directory(scenario)
+    if directory is None:
+        directory = recording.parent if recording is not None else default_directory(scenario)
     logs.about(run)
     design_first(scenario)
     with LiveTable(err, scenario, run, enabled=not quiet) as table:
         say = logs.log.warning if logs.as_json() else table.message
-        options = LaunchOptions(run, directory / f"{run}.logs", recording, restart, netns, table.update, say)
+
+        def update(nodes: Mapping[NodeId, Child], recorder: Child | None) -> None:
+            table.update(nodes, recorder)
+            if watch is not None:
+                watch(launcher, nodes, recorder)
+
+        options = LaunchOptions(run, directory / f"{run}.logs", recording, restart, netns, health_s, update, say)
         launcher = Launcher(scenario, options)
         on_signals(launcher.interrupt)
         result = launcher.run()
@@ -174,6 +193,7 @@ def node(
     emulation: Annotated[
         bool, typer.Option("--emulation/--no-emulation", help="Do to messages what the scenario's links say.")
     ] = True,
+    health: Annotated[float, typer.Option(hidden=True)] = 0.0,
     as_json: Json = False,
     control_fd: ControlFd = None,
 ) -> None:
@@ -193,6 +213,7 @@ def node(
             epoch_ns=None if epoch is None else epoch_ns(epoch),
             steps=None if forever else loaded.steps,
             emulate=emulation,
+            health_s=0.0 if control is None else health,
         )
         tell = teller(control, supervisor, supervisor.node)
 
@@ -200,8 +221,12 @@ def node(
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
             control.tell(blow=asdict(blow), report=asdict(live.report()) if blow.kind == "kill" else None)
 
+        def tell_health(told: Any) -> None:
+            """Tell the launcher, for whoever watches."""
+            control.tell(health=told)
+
         logs.about(options.run, own)
-        live = LiveNode(loaded, own, options, tell, None if control is None else announce)
+        live = LiveNode(loaded, own, options, tell, None if control is None else announce, tell_health)
         logs.about(options.run, own, lambda: None if live.node is None else live.node.step)
         on_signals(live.stop)
         if control is not None:
@@ -233,7 +258,7 @@ def record(
     from zfusion.drivers.endpoints import recorder_endpoints
     from zfusion.drivers.recorder import Recorder
     from zfusion.methods import chosen
-    from zfusion.recording.writer import RecordingWriter
+    from zfusion.recording import Keeping, RecordingWriter
 
     control = control_of(control_fd, deadly=False)
     with ToldTo(control), supervised(control) as supervisor:
@@ -252,6 +277,7 @@ def record(
             stages=chosen(loaded).stages,
             design=content_of(loaded) if loaded.method.design is not None else None,
             facts=None if network is None else {"network": network},
+            keeping=Keeping.of(loaded.recording),
         )
         tell = teller(control, supervisor, supervisor.recorder)
         endpoints = recorder_endpoints(loaded, connect, listen)
@@ -265,6 +291,9 @@ def record(
         control.tell(report=report)
         return
     finish(report, as_json, lambda: out.print(f"{report['messages']} messages in {report['path']}"))
+    if report["stopped"]:
+        err.print(f"{report['stopped']}: {report['unrecorded']} messages are not on the recording", soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def noted(

@@ -72,7 +72,7 @@ def configure(form: LogFormat, console: Console, *, verbose: bool) -> None:
         handler = logging.StreamHandler()
         handler.setFormatter(LineFormatter())
     handler.addFilter(_context)
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], force=True)
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
 
 
 def as_json() -> bool:

@@ -17,8 +17,8 @@ PATIENCE_S = 1.0
 
 
 @contextmanager
-def progress(text: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Gives a function that is told how many more of `total` are done."""
+def progress(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Gives a function that is told how many more of `total`, if that is known, are done."""
     with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(text, total=total)
 

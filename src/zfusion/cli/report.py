@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zfusion.cli.common import Json, err, finish, out
-from zfusion.errors import InputError
+from zfusion.cli.common import Json, err, finish, out, steps_range
 
 
 def report(
@@ -57,15 +55,4 @@ def _of_experiment(directory: Path, output: Path | None) -> tuple[Path, Path]:
 def _of_recording(recording: Path, output: Path | None, steps: str | None, figures: Path | None) -> Path:
     from zfusion.report.recording_report import write_report
 
-    return write_report(recording, output or recording.with_suffix(".html"), _range(steps), figures)
-
-
-def _range(text: str | None) -> range | None:
-    """``A:B``, both included, or ``A``; InputError for anything else."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", text)
-    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
-    if not 1 <= first <= last:
-        raise InputError(f"--steps: expected first:last, like 100:112 (is {text!r})")
-    return range(first, last + 1)
+    return write_report(recording, output or recording.with_suffix(".html"), steps_range(steps), figures)

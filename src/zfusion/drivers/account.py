@@ -128,11 +128,16 @@ class Account:
             node.sent[ARRIVALS.name] = seq + 1
             yield Message(node.id, max(node.step, node.born), ARRIVALS.name, seq, node.born, now_ns, {"data": data})
 
-    def report(self) -> NodeReport:
-        """What became of it all so far."""
-        node, latencies = self._node, Latencies()
+    def latencies(self) -> Latencies:
+        """From measurement to estimate, of all steps so far."""
+        latencies = Latencies()
         for pace in self._paces:
             latencies.merge(pace.latencies.sparse())
+        return latencies
+
+    def report(self) -> NodeReport:
+        """What became of it all so far."""
+        node = self._node
         return NodeReport(
             node=node.id,
             born=node.born,
@@ -144,7 +149,7 @@ class Account:
             edges=edge_report(node),
             fallbacks=node.fallbacks,
             errors={stage: errors.summary() for stage, errors in self._errors.items()},
-            latency=latencies.told(),
+            latency=self.latencies().told(),
             overheard=dict(self._source.counters),
             estimate=told_estimate(node),
             settled=self._paces[-1].told() if len(self._paces) > 1 else {},

@@ -109,6 +109,11 @@ class Hearing:
         """Take all that has come, whether or not it is due: there will be no later."""
         self.drain()
 
+    @property
+    def holds(self) -> int:
+        """How many messages links hold now."""
+        return 0
+
     def held(self, of: NodeId) -> list[bytes]:  # noqa: ARG002
         """A neighbour's messages that have come and are not there for the node yet."""
         return []
@@ -186,6 +191,11 @@ class EmulatedHearing(Hearing):
         while self._held:
             due, _, received, channel, data, message = heappop(self._held)
             self._listener.hear(Heard(channel, data, message, due, received, due))
+
+    @property
+    def holds(self) -> int:
+        """See `Hearing`."""
+        return len(self._held)
 
     def held(self, of: NodeId) -> list[bytes]:
         """See `Hearing`."""

@@ -102,13 +102,13 @@ class Inbox:
         self._channels[source] = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(capacity))
         self._keys[source] = bell or key
 
-    def subscribe_posted(self, source: Hashable, key: str) -> None:
-        """Have what is published on `key` go to `posted` as it comes."""
+    def subscribe_posted(self, source: Hashable | None, key: str) -> None:
+        """Have what is published on `key` go to `posted` as it comes; of no `source` but the key that it is on."""
 
         def post(sample: Any) -> None:
             data = sample.payload.to_bytes()
             if len(self.posted) < POSTED:
-                self.posted.append((source, data, self._now()))
+                self.posted.append((str(sample.key_expr) if source is None else source, data, self._now()))
                 self._alarm.set()
             else:
                 self.overrun += 1
@@ -188,7 +188,7 @@ class Inbox:
         for record in stack.records:
             if record.point == zenoh.InterceptionPoint.RECEIVE:
                 stamp: int = record.timestamp().get_time_as_ntp64().as_nanos()
-                return stamp + self._clock.ahead_ns
+                return self._clock.of_machine(stamp)
         return None
 
     def _watch(self) -> None:

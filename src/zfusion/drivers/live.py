@@ -17,13 +17,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any, cast
 
 from zfusion import keys
 from zfusion.drivers.account import Account, make_node, truth_message
-from zfusion.drivers.clocks import Clock, WrongClock, machine
+from zfusion.drivers.clocks import Clock, machine
 from zfusion.drivers.complaints import Complaints
 from zfusion.drivers.credentials import node_name
 from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.health import health
 from zfusion.drivers.hearing import EmulatedHearing, Heard, Hearing
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.key_source import KeySource
@@ -33,7 +35,7 @@ from zfusion.drivers.metrics import NodeReport, told_estimate
 from zfusion.drivers.misfortune import Blow, Misfortune
 from zfusion.drivers.presence import Presence, make_meeting
 from zfusion.drivers.sources import Source, open_source
-from zfusion.drivers.transport import RECEIPT, never_linger, open_session, prober, publisher
+from zfusion.drivers.transport import RECEIPT, closing, never_linger, open_session, prober, publisher
 from zfusion.errors import InputError
 from zfusion.links import LinkNetwork, ideal, links_of
 from zfusion.messages import Decoder, decode_any, encode
@@ -77,6 +79,8 @@ class LiveOptions:
     """Last step; None: until told to stop."""
     emulate: bool = True
     """Whether the node is to do to its neighbours' messages what the scenario's links say; False: the network does."""
+    health_s: float = 0.0
+    """How often to tell of its health; 0: never."""
 
 
 class LiveNode:
@@ -89,8 +93,10 @@ class LiveNode:
         options: LiveOptions,
         tell: Callable[[Status], None] | None = None,
         announce: Callable[[Blow], None] | None = None,
+        tell_health: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
-        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before.
+        """`tell` is called with the node's status a few times a second; `announce` with what fells it, just before;
+        `tell_health` with `health.health`, as often as `options` say.
 
         Raises InputError where Zenoh does not open, or the sensor's source or a link's, and for a plan that stops the
         node where nobody is there to set it going again.
@@ -111,6 +117,8 @@ class LiveNode:
         """Whether receivers are asked to stamp this step's messages."""
         self._estimates: list[Message] = []
         self._told_ns = self._lingerless_ns = 0
+        self._tell_health, self._health_ns = tell_health, round(options.health_s * 1e9)
+        self._told_health_ns = 0
         self._period_ns = scenario.timing.period_ns or 0
         """0 for a free-running node."""
         self._patient = scenario.timing.late == "wait"
@@ -118,11 +126,10 @@ class LiveNode:
         self._complaints = Complaints()
         self._misfortune = Misfortune(scenario, node, announce)
         link = links_of(scenario) if options.emulate else ideal
-        config = scenario.transport.zenoh_config
         self._session = open_session(
             options.endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
-            config_file=scenario.absolute(config) if config else None,
+            config_file=scenario.zenoh_config,
             name=node_name(node),
         )
         try:
@@ -130,27 +137,16 @@ class LiveNode:
         except InputError:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
-        self._clock = WrongClock() if self._misfortune.clock_goes_wrong else Clock()
+        self._clock = Clock()
         self._now = self._clock.now
         self._inbox = Inbox(self._session, self._clock)
         self._links = link if isinstance(link, LinkNetwork) else None
-        self._hearing = Hearing(self._inbox, self)
-        if self._links is not None:
-            self._hearing = EmulatedHearing(
-                self._inbox, self, node, self._links, self._misfortune.timeline, self._clock
-            )
+        self._hearing = self._hears()
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
         self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
+        why = prober(options.endpoints, scenario.zenoh_config)
         self._presence = Presence(
-            self,
-            self._meeting,
-            scenario,
-            self._graph,
-            options.run,
-            self._session,
-            self._inbox,
-            self._clock,
-            prober(options.endpoints, scenario.absolute(config) if config else None),
+            self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock, why
         )
 
     def run(self) -> NodeReport:
@@ -158,7 +154,7 @@ class LiveNode:
 
         Raises InputError where a neighbour runs another scenario or version, RunError where the source fails.
         """
-        with self._session:
+        with closing(self._session):
             try:
                 self._declare()
                 start = self._presence.join()
@@ -193,7 +189,21 @@ class LiveNode:
             estimate=told_estimate(node) if node else {},
             machine=None if self._misfortune.clock_goes_wrong else machine(),
             counts=self._counts() if counted else None,
+            line_ns=self._clock.line_ns,
+            clock_jumps=self._clock.jumps,
+            clock_offset_exceeded=self._presence.clocks.exceeded,
         )
+
+    def health(self, node: Node, account: Account) -> dict[str, Any]:
+        """See `health.health`."""
+        inbox = self._inbox
+        queues = {
+            "ahead": len(self._ahead),
+            "held": self._hearing.holds,
+            "posted": len(inbox.posted),
+            "notices": len(inbox.notices),
+        }
+        return health(node, account, queues=queues, overrun=inbox.overrun, now_ns=self._now())
 
     def report(self) -> NodeReport:
         """How it has gone so far."""
@@ -206,6 +216,7 @@ class LiveNode:
             refused["too_early"] = refused.get("too_early", 0) + 1
         report.overheard = self._overheard(report.overheard)
         report.clocks = self._clocks()
+        report.clock_jumps, report.clock_offset_exceeded = self._clock.jumps, self._presence.clocks.exceeded
         report.queues = self._queues()
         if self._links is not None:
             report.emulated = {str(j): dict(counts) for (j, _), counts in self._links.counters.items() if counts}
@@ -221,14 +232,20 @@ class LiveNode:
         )
 
     def _overheard(self, by_source: Mapping[str, int]) -> dict[str, int]:
-        total = Counter(by_source) + self._presence.overheard
-        return {**total, "overrun": self._inbox.overrun} if self._inbox.overrun else dict(total)
+        here = Counter(overrun=self._inbox.overrun, unheeded=self._presence.unheeded)
+        return dict(Counter(by_source) + self._presence.overheard + here)
 
     def _clocks(self) -> dict[str, dict[str, float]]:
-        return {str(j): told for j, offset in self._presence.clocks.items() if (told := offset.told())}
+        return {str(j): told for j, offset in self._presence.clocks.offsets.items() if (told := offset.told())}
 
     def _queues(self) -> dict[str, int]:
         return {"ahead": self._most_ahead, "held": self._hearing.most_held}
+
+    def _hears(self) -> Hearing:
+        """Directly, or through the links that the scenario describes."""
+        if self._links is None:
+            return Hearing(self._inbox, self)
+        return EmulatedHearing(self._inbox, self, self.id, self._links, self._misfortune.timeline, self._clock)
 
     def _subscribe(self, node: NodeId, key: str, ny: int) -> Source:
         """The source of the readings that a program of the user's publishes."""
@@ -344,6 +361,9 @@ class LiveNode:
             self._tell_arrivals()
             if now - self._told_ns > REPORT_NS:
                 self.tell_status()
+            if self._health_ns and now - self._told_health_ns >= self._health_ns:
+                self._told_health_ns = now
+                self._tell_health(self.health(node, account))
         for estimate in self._estimates:
             account.compare(estimate)
         self._estimates.clear()
@@ -430,6 +450,7 @@ class LiveNode:
         """Tell what was measured of the neighbours' messages, when it is time to."""
         assert self._account is not None  # steps are taken with one
         for message in self._account.arrivals(self._now(), ended=ended):
+            self._presence.clocks.mark(cast("dict[str, Any]", message.fields["data"]))
             self._publish[ARRIVALS.name](encode(message))
 
     def _tell_truth(self, node: Node, step: int, now: int) -> None:
@@ -458,6 +479,7 @@ class LiveNode:
 
     def tell_status(self) -> None:
         """Tell the launcher how the node is doing."""
+        self._look_at_clock()
         self._told_ns = self._now()
         if self._told_ns >= self._lingerless_ns + LINGERLESS_NS:
             self._lingerless_ns = self._told_ns
@@ -473,6 +495,13 @@ class LiveNode:
             refused: dict[str, Mapping[str, int]] = {f"node {j}": c.refused for j, c in self.node.counters.items()}
             refused["elsewhere"] = self._overheard(self._source.counters)
             self._complaints.look(self._now(), refused, ended=ended)
+
+    def _look_at_clock(self) -> None:
+        """See whether the machine's clock has jumped; this node's time goes on as before, but it is told."""
+        jump = self._clock.look()
+        if jump is not None and self.node is not None:
+            log.warning("the machine's clock has jumped: %s", jump)
+            self._carry_out([self.node.event("clock_jump", self._now(), **jump._asdict())])
 
     def _leave(self, node: Node) -> None:
         """Tell how it went, and see that everybody has heard everything."""

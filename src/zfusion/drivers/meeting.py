@@ -60,6 +60,8 @@ class Meeting:
     epoch_ns: int | None = None
     fixed_epoch: bool = False
     """The epoch was given: it is kept to, whoever is there by then."""
+    moved_ns: int = 0
+    """How far the node's clock was set forward since it was started."""
     present: set[NodeId] = field(default_factory=set)
     recorder: bool = False
     ready: dict[NodeId, int] = field(default_factory=dict)
@@ -90,6 +92,15 @@ class Meeting:
         absent += ["the recorder"] if self.needs_recorder and not self.recorder else []
         return absent or [f"node {j} to be ready" for j in sorted(self.swarm - self.ready.keys(), key=str)]
 
+    def agrees_with(self) -> frozenset[NodeId]:
+        """Whose clocks must agree with this node's before it begins: those of the nodes that run, or else of all.
+
+        Also of one that has gone meanwhile: it may have been the first to refuse. Empty until all who are there have
+        answered, as one of them may be running.
+        """
+        running = frozenset(j for j, status in self.heard.items() if status.phase is Phase.RUNNING)
+        return running or (self.linked if self.present <= self.heard.keys() else frozenset())
+
     def start(self, now: int) -> Start | None:
         """When to begin, if that can be said yet."""
         if self.needs_recorder and not self.recorder:
@@ -111,7 +122,7 @@ class Meeting:
         running = [
             s for s in self.heard.values() if s.phase is Phase.RUNNING and s.ready.get(self.own) != self.started_ns
         ]
-        awaited = self.linked if now < self.started_ns + JOIN_NS else self.present
+        awaited = self.linked if now < self.started_ns + self.moved_ns + JOIN_NS else self.present
         if not running or not awaited <= self.heard.keys():
             return None
         epoch = self.epoch_ns if self.epoch_ns is not None else now

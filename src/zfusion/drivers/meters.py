@@ -150,6 +150,11 @@ class Meter:
         folded = ((j, stage, channel.fold()) for (j, stage), channel in self._channels.items())
         yield from _batches(folded)
 
+    def waits(self) -> dict[str, dict[str, int]]:
+        """How long each stage was open, {stage: `Latencies.told`}, up to now."""
+        self._fold_waits()
+        return {stage: waits.told() for stage, waits in zip(self._stages, self._waits, strict=True)}
+
     def told(self) -> dict[str, Any]:
         """All of it as plain data, to be added up by `report.latency`.
 
@@ -164,11 +169,6 @@ class Meter:
                 "budget_ns": dict(zip(PARTS, channel.budget, strict=True)),
             }
         return {"edges": edges, "waits": self.waits(), "rounds": self._rounds, "rounds_ns": self._rounds_ns}
-
-    def waits(self) -> dict[str, dict[str, int]]:
-        """Stage -> how long it was open, up to now, as `Latencies.told`."""
-        self._fold_waits()
-        return {stage: waits.told() for stage, waits in zip(self._stages, self._waits, strict=True)}
 
     def budgets(self) -> dict[str, Any]:
         """What goes on a recording: rounds whose budget was kept, and edges {neighbour: {stage: nanoseconds of PARTS}}.

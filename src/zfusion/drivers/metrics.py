@@ -175,6 +175,10 @@ class NodeReport:
     """`Meter.told`: latencies, waits and budgets."""
     clocks: dict[str, dict[str, float]] = field(default_factory=dict)
     """Neighbour -> `ClockOffset.told`: how far its clock was ahead of this node's, where that was found out."""
+    clock_jumps: int = 0
+    """How often its machine's clock was seen to jump."""
+    clock_offset_exceeded: int = 0
+    """Readings of neighbours' clocks that were beyond what is allowed."""
     queues: dict[str, int] = field(default_factory=dict)
     """Messages that waited at the most: too far `ahead` of the node, `held` by emulated links."""
     emulated: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -239,11 +243,21 @@ class RecorderReport:
     """By topic, where anything is missing that its sender sent."""
     foreign: int = 0
     """What came and is not on the file: on keys that are none of the scenario's, or larger than any message is."""
+    files: list[str] = field(default_factory=list)
+    """Where the recording is: one file, or its segments."""
+    unrecorded: int = 0
+    """What came and could not be written, because the recording had stopped; also among the lost."""
+    overrun: int = 0
+    """What came and was dropped unread, being too much at once; also among the lost where its sender numbered it."""
+    stopped: str = ""
+    """Why the recording ended before the run did, if it did."""
+    unheeded: int = 0
+    """Questions, and news of nodes, that were dropped because too many waited."""
 
     @classmethod
     def of(cls, recording: Recording) -> RecorderReport:
         """Of a recording that is there."""
-        report = cls(str(recording.path), recording.messages)
+        report = cls(str(recording.path), recording.messages, files=list(map(str, recording.files)))
         for topic, count in recording.topics.items():
             with suppress(MessageError):
                 _, node, stage = keys.parse(topic)

@@ -103,7 +103,7 @@ def find_swarm(
     if entry is not None:
         return _noted(entry)
     transport = loaded.transport
-    own = loaded.absolute(transport.zenoh_config) if transport.zenoh_config else None
+    own = loaded.zenoh_config
     endpoints = Endpoints() if own else Endpoints(connect=tuple(listens_at(loaded).values()))
     low_latency = transport.preset == "lowlatency"
     return Swarm(run or loaded.name, endpoints, tuple(map(str, loaded.ids)), low_latency=low_latency, config=own)

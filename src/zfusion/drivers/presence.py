@@ -18,7 +18,9 @@ from typing import Any, ClassVar, Protocol
 import zenoh
 
 from zfusion import keys
-from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock, ClockOffset
+from zfusion.drivers.claims import Claims
+from zfusion.drivers.clock_watch import ClockWatch
+from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock
 from zfusion.drivers.endpoints import linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
@@ -49,6 +51,9 @@ and Zenoh's thread may be waiting for that while it holds what dropping needs.""
 
 MAX_NOTICES = 4096
 """Notices waiting, above which questions are not answered: neighbours ask seldom, and can ask again."""
+
+MOST_NOTICES = 65_536
+"""Notices waiting, above which nothing more is noted, and that is counted: only somebody who floods makes so many."""
 
 RECORDER = "the recorder"
 """Stands for it among node ids."""
@@ -91,6 +96,8 @@ class Presence:
         self._now = clock.now
         self.overheard: Counter[str] = Counter()
         """What came and was neither a question nor an answer, by reason."""
+        self.unheeded = 0
+        """What happened and was not noted, too much being to be attended to."""
         self.strangers: set[NodeId] = set()
         """Neighbours that run something else than this node."""
         self._host, self._scenario, self._graph, self._run = host, scenario, graph, run
@@ -101,9 +108,12 @@ class Presence:
         """Who has said that it had put its last messages."""
         self._answered: set[NodeId] = set()
         """Who was told how this node is doing."""
+        self._claims = Claims(meeting.own)
+        self._token: Any = None
         self._kept: list[Any] = []
-        self.clocks = {j: ClockOffset() for j in meeting.linked}
+        self.clocks = ClockWatch(scenario, meeting.own, meeting.linked, clock)
         """How far the neighbours' clocks are ahead of this node's."""
+        self._clock = clock
         self._read_clocks_ns = 0
 
     def declare(self) -> None:
@@ -116,22 +126,38 @@ class Presence:
             liveliness.declare_subscriber(keys.node_token(run, "*"), self._noting("token"), history=True),
             liveliness.declare_subscriber(keys.recorder_token(run), self._noting("recorder"), history=True),
         ]
-        self._kept.append(liveliness.declare_token(keys.node_token(run, own)))
+        self._show_token()
 
     def join(self) -> Start | None:
-        """Wait until it is time to begin; None if stopped before. InputError where somebody runs something else."""
+        """Wait until it is time to begin; None if stopped before.
+
+        InputError where somebody runs something else, or has a clock that is too far off.
+        """
         next_poll = self._now()
         next_word = next_poll + WORD_NS
+        line = self._clock.line_ns
         while not self._host.stopping:
             try:
                 self.handle_notices()
+                self.clocks.agree(self.meeting.agrees_with())
             except InputError:
                 self._be_refused()
                 raise
             now = self._now()
-            start = self.meeting.start(now)
+            if moved := self._clock.line_ns - line:
+                line += moved
+                next_poll += moved
+                next_word += moved
+                self.meeting.moved_ns += moved
+            self._claims.check(now)
+            self._show_token()
+            start = None if self._claims.contested else self.meeting.start(now)
             if start is not None:
+                self._clock.keep()
+                self.clocks.tell_unknown(self.meeting.present)
                 return start
+            if self.meeting.epoch_ns is not None and not self.meeting.fixed_epoch:
+                self._clock.keep()  # it was agreed on by what the clocks say now
             if now >= next_poll:
                 next_poll = now + POLL_NS
                 for j in self.meeting.present:
@@ -173,13 +199,22 @@ class Presence:
         """Ask the neighbours on other machines for the time, if it is time to."""
         if now_ns >= self._read_clocks_ns:
             self._read_clocks_ns = now_ns + ASK_AGAIN_NS
-            for j, clock in self.clocks.items():
-                if j in self.meeting.present and not clock.same_machine:
+            for j, clock in self.clocks.offsets.items():
+                if j in self.meeting.present and clock.error_ns != 0:
                     self._ask_status(j)
 
     def ask_history(self, j: NodeId) -> None:
         """Ask a neighbour what it used; the node is told what it answers."""
         self._query(keys.history_key(self._run, j), "history!", j)
+
+    def _show_token(self) -> None:
+        """Say that this node is there, unless there may be another of its id: whether that one goes is to be seen."""
+        if self._claims.contested:
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+        elif self._token is None:
+            self._token = self._session.liveliness().declare_token(keys.node_token(self._run, self.meeting.own))
 
     def handle_notices(self) -> None:
         """Act on all that has happened."""
@@ -198,8 +233,11 @@ class Presence:
         return on_zenoh_thread(partial(self._note, kind))
 
     def _note(self, kind: str, about: Any) -> None:
-        if kind in QUESTIONS and len(self._inbox.notices) >= MAX_NOTICES:
-            about.drop()
+        waiting = len(self._inbox.notices)
+        if waiting >= (MAX_NOTICES if kind in QUESTIONS else MOST_NOTICES):
+            self.unheeded += 1
+            if kind in QUESTIONS:
+                about.drop()
         else:
             self._inbox.notify((kind, about, self._now()))
 
@@ -209,7 +247,13 @@ class Presence:
         self._session.get(
             key,
             on_zenoh_thread(lambda reply: self._note(kind, (about, reply, asked_ns))),
-            payload=encode_any({"from": self.meeting.own, "leaving": self._host.phase is Phase.DONE}),
+            payload=encode_any(
+                {
+                    "from": self.meeting.own,
+                    "started": self.meeting.started_ns,
+                    "leaving": self._host.phase is Phase.DONE,
+                }
+            ),
             timeout=ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
@@ -219,9 +263,9 @@ class Presence:
 
     def _be_refused(self) -> None:
         """Stay until those who are there have been told, too, what this node runs: they are to say so themselves."""
-        end = self._now() + int(ANSWER_S * 1e9)
-        while not self._host.stopping and not self.meeting.present <= self._answered and self._now() < end:
-            self._inbox.rest(end)
+        end = time.monotonic() + ANSWER_S
+        while not self._host.stopping and not self.meeting.present <= self._answered and time.monotonic() < end:
+            self._inbox.rest(self._now() + POLL_NS)
             with suppress(InputError):
                 self.handle_notices()
 
@@ -240,6 +284,7 @@ class Presence:
             return
         if sample.kind == zenoh.SampleKind.DELETE:
             self.meeting.went(j)
+            self._claims.gone(j)
             self._leaving.discard(j)
             self._unconfirmed.discard(j)
             if self._host.phase is Phase.RUNNING and j in self.meeting.hears:
@@ -271,7 +316,8 @@ class Presence:
         if status.node != j:
             raise MessageError(Reason.WRONG_NODE, f"{status.node} answers for {j}")
         self._unconfirmed.discard(j)
-        self._read_clock(status, about[2], at_ns)
+        self.clocks.read(status, self._host.status().machine, about[2], at_ns, begun=node is not None)
+        self._claims.answered(j, status.holder_ns)
         if node is None:
             self.meeting.answered(status)
             return
@@ -285,13 +331,6 @@ class Presence:
         if j in self.meeting.hears and j in self.meeting.present and status.phase is not Phase.DONE:
             node.back(j)
 
-    def _read_clock(self, status: Status, asked_ns: int, answered_ns: int) -> None:
-        """What an answer tells of its sender's clock."""
-        clock, own = self.clocks.get(status.node), self._host.status().machine
-        if clock is not None:
-            clock.same_machine = own is not None and status.machine == own
-            clock.read(asked_ns, status.heard_ns, status.told_ns, answered_ns)
-
     def _on_history(self, about: tuple[NodeId, Any, int], _at_ns: int) -> None:
         of, reply, node = about[0], about[1].ok, self._host.node
         if reply is None or node is None:
@@ -302,14 +341,21 @@ class Presence:
     def _answer_status(self, query: Any, at_ns: int) -> None:
         with query:
             question = decode_any(query.payload.to_bytes()) if query.payload is not None else {}
+            asker, started = question.get("from"), question.get("started")
+            known = type(asker) in (int, str) and asker in self.meeting.linked  # whoever else asks is not remembered
+            holder = self._holder(asker, started) if known and type(started) is int else None
             status = self._host.status(counted=question.get("counts") is True)
-            status = replace(status, heard_ns=at_ns, told_ns=self._now())
+            status = replace(status, heard_ns=at_ns, told_ns=self._now(), holder_ns=holder)
             query.reply(keys.status_key(self._run, self.meeting.own), status.encode())
-            asker = question.get("from")
-            if isinstance(asker, int | str):
+            if asker is not None and known and holder is None:
                 self._answered.add(asker)
                 if question.get("leaving"):
                     self._leaving.add(asker)
+
+    def _holder(self, asker: Any, started_ns: int) -> int | None:
+        """The process that is known under an asker's id, if it is another one."""
+        present, begun = asker in self.meeting.present, self._host.node is not None
+        return self._claims.asked(asker, started_ns, present=present, begun=begun)
 
     def _answer_history(self, query: Any, _at_ns: int) -> None:
         with query:

@@ -2,15 +2,18 @@
 
 It shows the same liveliness token all the while, so that nodes begin only when it is there, and answers a query when
 all that was published before it has arrived, so that nodes leave only when it has their last messages.
+
+When it cannot follow, senders wait for it, and nothing is lost; or they do not, and what is too much is dropped and
+counted (`recording.when_full`). When it can write no more (disk full), it goes on to receive and to count: a swarm is
+not to suffer from its recorder.
 """
 
 from __future__ import annotations
 
 import logging
 import platform
-import time
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,16 +21,19 @@ from typing import Any
 import zenoh
 
 from zfusion import keys
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
-from zfusion.drivers.transport import never_linger, on_zenoh_thread, open_session
-from zfusion.errors import MessageError
+from zfusion.drivers.transport import closing, never_linger, on_zenoh_thread, open_session
+from zfusion.errors import MessageError, RecordingError, RunError
+from zfusion.gaps import Gaps
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
+from zfusion.recording.reader import Recording
 from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH, TRUTH_SENDER, Stage
 from zfusion.status import RecorderStatus
@@ -35,7 +41,14 @@ from zfusion.status import RecorderStatus
 log = logging.getLogger(__name__)
 
 CAPACITY = 65_536
-"""Messages that wait for the disk: seconds of a large swarm, tens of MB. Beyond it senders wait, and lose nothing."""
+"""Messages that wait for the disk where senders wait when it is full: seconds of a large swarm, tens of MB."""
+
+GRACE_NS = 5_000_000_000
+"""How long nodes that vanished without a word, or with their router, which is back, may take to come back: a recorder
+that stood still finds all links broken."""
+
+MAX_NOTICES = 65_536
+"""Questions and news of nodes that wait; beyond it they are dropped, and counted: whoever asks can ask again."""
 
 CHANNEL = "all"
 
@@ -47,6 +60,7 @@ class _Topic:
     node: NodeId | None
     """None for the truth."""
     stage: Stage
+    received: int = 0
     recorded: int = 0
     decoder: Decoder | None = None
 
@@ -70,26 +84,36 @@ class Recorder:
         self._ids = {str(i) for i in scenario.ids}
         self._topics = _topics(scenario, run)
         self._flush_ns = round(scenario.recording.flush_interval_s * 1e9)
+        recording, paced = scenario.recording, scenario.timing.period_ns is not None
+        self._waits = recording.when_full == "wait" or (recording.when_full is None and not paced)
         self._seen: set[str] = set()
         self._present: set[str] = set()
+        self._left: set[str] = set()
+        """Those whose last words have come."""
+        self._routed = False
+        """Whether nodes are reached through a router."""
+        self._empty_since = 0
+        """When the last of all nodes had gone."""
         self._stopping = False
         self._bell = f"{keys.recorder_token(run)}/bell"
-        self._sent: dict[str, dict[int, int]] = defaultdict(dict)
         self._report = RecorderReport(str(writer.path))
-        config = scenario.transport.zenoh_config
+        self._failed = False
         self._session = open_session(
             endpoints,
             low_latency=scenario.transport.preset == "lowlatency",
-            config_file=scenario.absolute(config) if config else None,
+            config_file=scenario.zenoh_config,
             name=RECORDER_NAME,
         )
-        self._inbox = Inbox(self._session)
-        writer.is_legal = self.is_legal
+        self._clock = Clock()
+        self._clock.keep()
+        self._inbox = Inbox(self._session, self._clock)
+        writer.accounts.is_legal = self.is_legal
+        writer.accounts.is_topic = self._topics.__contains__
 
     def run(self) -> RecorderReport:
-        """Record; the file is finished when this returns, whatever ends it. RunError when writing fails."""
+        """Record; the file is finished when this returns, whatever ends it. What could not be written is told."""
         try:
-            with self._session:
+            with closing(self._session):
                 try:
                     self._declare()
                     self._record()
@@ -105,7 +129,10 @@ class Recorder:
         self._inbox.notify(None)
 
     def _declare(self) -> None:
-        self._inbox.subscribe(CHANNEL, keys.whole_run(self._run), CAPACITY, self._bell)
+        if self._waits:
+            self._inbox.subscribe(CHANNEL, keys.whole_run(self._run), CAPACITY, self._bell)
+        else:
+            self._inbox.subscribe_posted(None, keys.whole_run(self._run))
         tokens = keys.node_token(self._run, "*")
         self._kept = [
             self._session.declare_queryable(
@@ -118,36 +145,67 @@ class Recorder:
         ]
 
     def _note(self, kind: str, about: Any) -> None:
-        self._inbox.notify((kind, about))
+        if len(self._inbox.notices) < MAX_NOTICES:
+            self._inbox.notify((kind, about))
+            return
+        self._report.unheeded += 1
+        if kind == "status?":
+            about.drop()
 
     def _record(self) -> None:
-        inbox, writer = self._inbox, self._writer
-        next_flush = time.time_ns() + self._flush_ns
+        inbox = self._inbox
+        next_flush = self._clock.now() + self._flush_ns
         while True:
-            sample = inbox.wait_sample(CHANNEL, next_flush)
-            now = time.time_ns()
-            if sample is not None:
-                self._write(sample, now)
+            if self._waits:
+                sample = inbox.wait_sample(CHANNEL, next_flush)
+                if sample is not None:
+                    self._receive(str(sample.key_expr), sample.payload, self._clock.now())
+            elif not self._take():
+                inbox.rest(next_flush, or_posted=True)
+            now = self._clock.now()
             if now >= next_flush:
                 next_flush = now + self._flush_ns
-                writer.flush()
+                self._clock.look()
+                self._try(self._writer.flush)
                 if self._tell is not None:
                     self._tell(self._count())
-            if inbox.notices and self._handle_notices():
+            if inbox.notices:
+                self._handle_notices()
+            if self._stopping or self._everybody_left(now):
+                self._drain()
                 return
 
-    def _write(self, sample: Any, now: int) -> None:
-        key = str(sample.key_expr)
+    def _take(self) -> bool:
+        """Write the next message that was posted, if there is one."""
+        if not self._inbox.posted:
+            return False
+        key, data, at = self._inbox.posted.popleft()
+        self._receive(key, data, at)
+        return True
+
+    def _receive(self, key: str, payload: Any, now: int) -> None:
+        """A message came: bytes, or what Zenoh has in their place."""
         topic = self._topics.get(key)
-        payload = sample.payload
         if topic is None or len(payload) > MAX_MESSAGE_BYTES:
             self._report.foreign += key != self._bell
             return
-        data = payload.to_bytes()
-        self._writer.write(key, data, now)
-        topic.recorded += 1
-        if topic.stage is EVENT:
-            self._note_totals(key, data)
+        data = payload if isinstance(payload, bytes) else payload.to_bytes()
+        topic.received += 1
+        if topic.stage is EVENT and topic.node is not None and _is_farewell(data):
+            self._left.add(str(topic.node))
+        before = self._writer.messages
+        self._try(partial(self._writer.write, key, data, now))
+        topic.recorded += self._writer.messages - before
+
+    def _try(self, write: Callable[[], None]) -> None:
+        """Write, as long as that can be done."""
+        if not self._report.stopped:
+            try:
+                write()
+            except RunError as error:
+                self._failed, self._report.stopped = True, str(error)
+            else:
+                self._report.stopped = self._writer.stopped
 
     def is_legal(self, key: str, data: bytes) -> bool:
         """Whether bytes are a message that the node whose key they came on can have sent."""
@@ -177,27 +235,13 @@ class Recorder:
                 report.recorded[topic.stage.name] = report.recorded.get(topic.stage.name, 0) + topic.recorded
         report.by_key = {f"{t.node}/{t.stage.name}": t.recorded for t in self._topics.values() if t.recorded}
         report.messages = sum(report.recorded.values())
+        report.unrecorded = sum(topic.received - topic.recorded for topic in self._topics.values())
+        report.overrun = self._inbox.overrun
+        report.files = list(map(str, self._writer.files))
         return report
 
-    def _note_totals(self, topic: str, data: bytes) -> None:
-        """What a leaving node says that it has sent."""
-        try:
-            event = decode_any(data)
-        except MessageError:
-            return
-        details = event.get("data")
-        if event.get("kind") != "stopped" or not isinstance(details, dict) or not isinstance(event.get("born"), int):
-            return
-        sent = details.get("sent")
-        if not isinstance(sent, dict):
-            return
-        for stage, count in sent.items():
-            if isinstance(count, int) and isinstance(stage, str):
-                key = keys.truth_key(self._run) if stage == TRUTH.name else topic.removesuffix(EVENT.name) + stage
-                self._sent[key][event["born"]] = count
-
-    def _handle_notices(self) -> bool:
-        """Act on what happened; True when it is time to end."""
+    def _handle_notices(self) -> None:
+        """Act on what happened."""
         notices = self._inbox.notices
         for _ in range(len(notices)):
             notice = notices.popleft()
@@ -208,35 +252,49 @@ class Recorder:
                 self._on_token(about)
             else:
                 self._answer(about)
-        everybody_left = self._until_all_gone and self._seen == self._ids and not self._present
-        if self._stopping or everybody_left:
-            self._drain()
-            return True
-        return False
 
     def _answer(self, query: Any) -> None:
         """Tell what is on the file, and how much waited for it."""
-        waiting = self._drain()  # the asker's messages are in the channel, before its question
+        waiting = self._drain()  # the asker's messages came before its question
         report = self._count()
         status = RecorderStatus(
             messages=report.messages,
             foreign=report.foreign,
             lost=sum(self._writer.lost().values()),
             waiting=waiting,
+            unrecorded=report.unrecorded,
+            overrun=report.overrun,
+            stopped=report.stopped,
             path=report.path,
             host=platform.node(),
         )
         with query:  # queries are to be dropped explicitly, see `presence.QUESTIONS`
             query.reply(keys.recorder_status_key(self._run), status.encode())
 
+    def _everybody_left(self, now: int) -> bool:
+        """Whether all nodes have come and gone: with a word, or for good.
+
+        Behind a router they may only be out of sight with it.
+        """
+        if not self._until_all_gone or self._present or self._seen != self._ids:
+            self._empty_since = 0
+            return False
+        out_of_sight = self._routed and not self._session.info.routers_zid()
+        self._empty_since = now if out_of_sight else self._empty_since or now
+        return self._left >= self._ids or now >= self._empty_since + GRACE_NS
+
     def _drain(self) -> int:
         """Write what is there by now; how many messages that was."""
-        for number in range(CAPACITY):
-            sample = self._inbox.poll_sample(CHANNEL)
-            if sample is None:
+        most = max(CAPACITY, len(self._inbox.posted))
+        for number in range(most):
+            if self._waits:
+                sample = self._inbox.poll_sample(CHANNEL)
+                if sample is None:
+                    return number
+                self._receive(str(sample.key_expr), sample.payload, self._clock.now())
+            elif not self._take():
                 return number
-            self._write(sample, time.time_ns())
-        return CAPACITY
+        return most
 
     def _on_token(self, sample: Any) -> None:
         try:
@@ -247,18 +305,47 @@ class Recorder:
             return
         if sample.kind == zenoh.SampleKind.PUT:
             never_linger()  # there is a new link
+            self._routed = bool(self._session.info.routers_zid())
             self._seen.add(node)
             self._present.add(node)
+            self._left.discard(node)
             log.info("node %s is there", node)
         else:
             self._present.discard(node)
             log.info("node %s is gone", node)
 
     def _finish(self) -> None:
-        self._count()
-        accounts = self._writer.finish(sent=self._sent, facts={"foreign": str(self._report.foreign)})
-        self._report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
-        log.info("%d messages in %s", self._report.messages, self._report.path)
+        report, facts = self._count(), {"foreign": str(self._report.foreign), "overrun": str(self._inbox.overrun)}
+        accounts: dict[str, Gaps] = {}
+        try:
+            accounts = self._writer.finish(facts=facts)
+        except RunError as error:
+            self._failed, report.stopped = True, report.stopped or str(error)
+            accounts = self._writer.finish()  # there is nothing more to write
+        if self._failed:
+            self._recount()
+            self._count()
+        report.lost = {topic: gaps.lost for topic, gaps in accounts.items() if gaps.lost}
+        for key, topic in self._topics.items():
+            if topic.received > topic.recorded:
+                report.lost[key] = report.lost.get(key, 0) + topic.received - topic.recorded
+        log.info("%d messages in %s", report.messages, report.path)
+
+    def _recount(self) -> None:
+        """What was written last may not have come to the disk when that failed: see what is there."""
+        counts: Mapping[str, int] = {}
+        with suppress(RecordingError), Recording.open(self._writer.path) as recording:
+            counts = recording.topics
+        for key, topic in self._topics.items():
+            topic.recorded = counts.get(key, 0)
+
+
+def _is_farewell(data: bytes) -> bool:
+    """Whether an event says that its sender leaves."""
+    try:
+        return bool(decode_any(data).get("kind") == "stopped")
+    except MessageError:
+        return False
 
 
 def _topics(scenario: Scenario, run: str) -> dict[str, _Topic]:

@@ -44,7 +44,7 @@ class Entry:
     enter: tuple[str, ...] = ()
     """The words before a command that have it run where the nodes can be reached, if that is not everywhere."""
     pid: int = field(default_factory=os.getpid)
-    birth: str | None = field(default_factory=lambda: _birth(os.getpid()))
+    birth: str | None = field(default_factory=lambda: birth(os.getpid()))
     """What tells the process from others that had, or will have, its id."""
 
 
@@ -116,7 +116,7 @@ def _read(path: Path) -> Entry | None:
     try:
         raw = json.loads(path.read_text())
         entry = Entry(**{**raw, "endpoints": dict(raw["endpoints"]), "enter": tuple(raw["enter"])})
-        gone = _birth(entry.pid) != entry.birth
+        gone = birth(entry.pid) != entry.birth
     except FileNotFoundError:  # it has just ended
         return None
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -127,13 +127,13 @@ def _read(path: Path) -> Entry | None:
     return None if gone else entry
 
 
-def _birth(pid: int) -> str | None:
+def birth(pid: int) -> str | None:
     """When a process began, since this machine did, and which start of the machine; None where there is none."""
     try:
-        started = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+        state, *rest = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return "running" if not Path("/proc/self/stat").exists() and _exists(pid) else None
-    return f"{machine()}/{started}"
+    return None if state == "Z" else f"{machine()}/{rest[18]}"
 
 
 def _exists(pid: int) -> bool:

@@ -25,6 +25,7 @@ from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.node import Ask, Effect, Node
+from zfusion.recording.keeping import Keeping
 from zfusion.recording.writer import RecordingWriter
 from zfusion.stages import ESTIMATE, Message
 
@@ -478,6 +479,7 @@ def simulate(
         stages=chosen(scenario).stages,
         design=content_of(scenario),
         facts={"world": "simulated"},
+        keeping=Keeping(scenario.recording.compression),
     ) as writer:
         simulation = Simulation(scenario, run=run, link=link, record=writer.write, sources=sources, observe=observe)
         try:

@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 
-from zfusion.model.streams import BLOCK, Recent
+from zfusion.model.streams import BLOCK, Ends, Recent
 
 Uniforms = Callable[[int], Sequence[float]]
 """The BLOCK random numbers, uniform in [0, 1), of a block of steps."""
@@ -16,15 +16,15 @@ class Chain:
     """States 0, 1, ...: `initial` are the probabilities at step 1, row i of `transition` those after state i.
 
     The state at step k is a function of those random numbers that belong to the steps up to k: earlier blocks are gone
-    through once, and of each only the last state is kept.
+    through once, and of the last of them only the last state is kept (`Ends`).
     """
 
     def __init__(self, initial: Sequence[float], transition: Sequence[Sequence[float]], uniforms: Uniforms) -> None:
         self._initial = tuple(accumulate(initial))
         self._rows = [tuple(accumulate(row)) for row in transition]
         self._uniforms = uniforms
-        self._last: list[int] = []
-        """The state at the end of each block so far."""
+        self._before = Ends(-1, lambda number: self._run(number)[-1])
+        """The state at the end of the block before."""
         self._recent = Recent(self._states)
 
     def __call__(self, step: int) -> int:
@@ -36,16 +36,13 @@ class Chain:
         return self._recent(number)
 
     def _states(self, number: int) -> list[int]:
-        for before in range(len(self._last), number):
-            self._last.append(self._run(before)[-1])
         states = self._run(number)
-        if number == len(self._last):
-            self._last.append(states[-1])
+        self._before.note(number + 1, states[-1])
         return states
 
     def _run(self, number: int) -> list[int]:
         rows, most = self._rows, len(self._rows) - 1
-        cumulative = rows[self._last[number - 1]] if number else self._initial
+        cumulative = rows[self._before(number)] if number else self._initial
         states = []
         for n, u in enumerate(self._uniforms(number)):
             # rounding may leave the sum of a row a little below 1, and u above it

@@ -20,6 +20,7 @@ from zfusion.methods.family import Family
 from zfusion.methods.fusion import fuse, fusion_weights
 from zfusion.methods.least_squares import LeastSquaresFilter, Standing
 from zfusion.methods.neighbourhood import Neighbourhood, StepModels
+from zfusion.methods.packing import IMPOSSIBLE, too_large
 from zfusion.methods.protocol import Fields, Outcome, Setting
 from zfusion.model.network import Network
 from zfusion.model.statistics import PriorMoments, prior_moments, step_models
@@ -52,6 +53,10 @@ class Centralized:
         self._window = setting.window
         self._past = {setting.born - 1: _Past({}, self._filter.standing)}
         """The last steps, as far as they may be gone back to, and the one before them."""
+
+    def refuses(self, stage: int, fields: Fields) -> str | None:
+        """Numbers that are too large to be computed with: one of them, and no later estimate would be a number."""
+        return IMPOSSIBLE if too_large(fields, "y" if stage == 0 else "x") else None
 
     def begin(self, step: int, y: Array | None) -> Fields:  # noqa: ARG002
         """The measurement, as it is."""

@@ -15,7 +15,7 @@ import numpy as np
 from zfusion.errors import RunError
 from zfusion.model.checks import semidefinite_factor
 from zfusion.model.matrices import RandomMatrix, Schedule, Streams
-from zfusion.model.streams import BLOCK, Recent, Seeds
+from zfusion.model.streams import BLOCK, Ends, Recent, Seeds
 from zfusion.model.system import System
 from zfusion.model.types import Array, NodeId
 
@@ -24,19 +24,19 @@ class SamplePath:
     """One realisation of a system, given by its seed (an integer >= 0), the same bits in every process.
 
     Made in blocks of BLOCK steps as they are asked for, of which the last few are kept. Steps may come in any order:
-    going far forward rolls the state through all steps between (once), going far back makes one block again. For
-    this, one state per block is remembered. RunError at the step at which an unstable state leaves the range of
-    floating-point numbers.
+    going far forward rolls the state through all steps between (once), going back makes one block again. For this, the
+    states of the last KEPT_ENDS blocks are remembered; going back further rolls from the beginning. RunError at the
+    step at which an unstable state leaves the range of floating-point numbers.
     """
 
     def __init__(self, system: System, seed: int) -> None:
         self._system = system
         self._seeds = Seeds(seed)
         self._noise = system.noise.sampler(self._seeds)
-        self._entries: list[Array] = [self._initial_state()]
-        """The states before the first step of each block so far; x_0 itself for the first block."""
+        self._entries = Ends(self._initial_state(), self._end)
+        """The states before the first step of each block; x_0 itself for the first block."""
         self._lost_at: float = inf
-        self._states = Recent(self._state_block)
+        self._states = Recent(self._roll)
         self._measurements = {i: Recent(partial(self._measurement_block, i)) for i in system.ids}
 
     def truth(self, k: int) -> Array:
@@ -64,15 +64,14 @@ class SamplePath:
         standard = self._seeds.generator("initial state").standard_normal(factor.shape[1])
         return self._system.initial_mean + factor @ standard
 
-    def _state_block(self, block: int) -> Array:
-        while len(self._entries) <= block:
-            self._entries.append(self._roll(len(self._entries) - 1)[-1].copy())
-            self._check_not_lost(len(self._entries) * BLOCK - BLOCK)
-        return self._roll(block)
+    def _end(self, block: int) -> Array:
+        end: Array = self._roll(block)[-1].copy()
+        self._check_not_lost((block + 1) * BLOCK)
+        return end
 
     def _roll(self, block: int) -> Array:
         """x_k for the steps k of a block, (BLOCK, nx), from the state before."""
-        state = self._entries[block]
+        state = self._entries(block)
         noises = self._noise.process(block)
         transitions = _draw(self._system.F, block * BLOCK - 1, self._seeds.streams("F", block=block))
         states = np.empty_like(noises)

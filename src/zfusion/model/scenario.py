@@ -194,6 +194,12 @@ class Scenario(Spec):
         given = self.transport.endpoints.get(i)
         return given or f"tcp/127.0.0.1:{self.transport.base_port + self._ranks[i]}"
 
+    @property
+    def zenoh_config(self) -> Path | None:
+        """The Zenoh configuration that its processes use, if it names one."""
+        named = self.transport.zenoh_config
+        return self.absolute(named) if named else None
+
     @cached_property
     def _ranks(self) -> dict[NodeId, int]:
         return {i: rank for rank, i in enumerate(self.ids)}

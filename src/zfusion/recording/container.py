@@ -8,9 +8,11 @@ for each.
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple, TypeVar
@@ -18,7 +20,21 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    MessageIndex,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
 from mcap.stream_reader import get_chunk_data_stream
 
 from zfusion.errors import RecordingError
@@ -29,16 +45,42 @@ _FRAME = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS = 22
 """Bytes of a message record between its frame and its data."""
+_LENGTH = struct.Struct("<Q")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<BQQQQII")
+"""Frame, times, uncompressed size, checksum, and the length of the compression's name."""
 _OPCODES = frozenset(int(opcode) for opcode in Opcode)
+_KINDS: Mapping[int, type] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+    Opcode.DATA_END: DataEnd,
+}
+
+MAX_RECORD = 1 << 29
+"""Bytes of a record; no chunk is larger, and nothing else nearly as large."""
+
+MAX_CHUNK = 1 << 28
+"""Bytes of a chunk's records; what says that it has more is damaged, or would fill the memory."""
 
 _R = TypeVar("_R")
+_Bytes = bytes | mmap.mmap
 
 
 class Damage(RecordingError):
-    """A file that is not what was written; `position` is the byte where that shows."""
+    """A file that is not what was written; `position` is the byte where that shows, `what` says how."""
 
     def __init__(self, position: int, what: str) -> None:
         self.position = position
+        self.what = what
         super().__init__(f"damaged at byte {position}: {what}")
 
 
@@ -111,6 +153,8 @@ def check_message_index(frame: Frame) -> None:
 def unpack_chunk(body: bytes, position: int) -> tuple[Chunk, bytes]:
     """A chunk and the records in it, uncompressed; Damage if its checksum does not agree, or it has none."""
     chunk = parse(Chunk, Frame(Opcode.CHUNK, position, b"", body))
+    if chunk.uncompressed_size > MAX_CHUNK:
+        raise Damage(position, f"a chunk of {chunk.uncompressed_size} bytes, where {MAX_CHUNK} are the most")
     try:
         stream, length = get_chunk_data_stream(chunk)
         data = stream.read(length)
@@ -121,11 +165,31 @@ def unpack_chunk(body: bytes, position: int) -> tuple[Chunk, bytes]:
     return chunk, data
 
 
-def chunk_channels(data: bytes, position: int) -> Iterator[Channel]:
-    """The channels that a chunk's records declare. `position` is the chunk's, for errors."""
+def chunk_declarations(data: bytes, position: int) -> Iterator[Channel | Schema]:
+    """The channels and schemas that a chunk's records declare. `position` is the chunk's, for errors."""
     for opcode, start, end in _chunk_frames(data, position):
         if opcode == Opcode.CHANNEL:
             yield parse(Channel, Frame(opcode, position, b"", data[start:end]))
+        elif opcode == Opcode.SCHEMA:
+            yield parse(Schema, Frame(opcode, position, b"", data[start:end]))
+
+
+def chunk_contents(data: bytes, position: int) -> tuple[list[Channel | Schema], Counter[int], int, int]:
+    """(declarations, messages by channel, lowest log time, highest) of a chunk; Damage if it holds anything else."""
+    declared: list[Channel | Schema] = []
+    counts: Counter[int] = Counter()
+    first_ns, last_ns = 2**64, 0
+    for opcode, start, end in _chunk_frames(data, position):
+        if opcode == Opcode.MESSAGE and end - start >= _MESSAGE_FIELDS:
+            channel, _, log_time, _ = _MESSAGE_HEAD.unpack_from(data, start)
+            counts[channel] += 1
+            first_ns, last_ns = min(first_ns, log_time), max(last_ns, log_time)
+        elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+            frame = Frame(opcode, position, b"", data[start:end])
+            declared.append(parse(Channel, frame) if opcode == Opcode.CHANNEL else parse(Schema, frame))
+        else:
+            raise Damage(position, f"the chunk holds a record of type {opcode}")
+    return declared, counts, first_ns, last_ns
 
 
 def chunk_messages(
@@ -153,6 +217,46 @@ def chunk_messages(
         raise Damage(position, f"the chunk has messages of channel {channel_id}, which is declared nowhere") from None
     if place != size:
         raise Damage(position, "the chunk holds half a record")
+
+
+def frame_length(data: _Bytes, place: int) -> int:
+    """Bytes of the record that begins there, with its frame, by its own account; very many if it has no frame."""
+    if place + _FRAME.size > len(data):
+        return 2**64
+    length: int = _FRAME.unpack_from(data, place)[1]
+    return _FRAME.size + length
+
+
+def chunk_length(data: _Bytes, place: int) -> int:
+    """Bytes of the chunk that begins there, by what it says of its contents; 0 if it cannot be one."""
+    if place + _CHUNK.size > len(data):
+        return 0
+    *_, uncompressed, _, words = _CHUNK.unpack_from(data, place)
+    if words > len("zstd") or uncompressed > MAX_CHUNK or place + _CHUNK.size + words + _LENGTH.size > len(data):
+        return 0
+    (stored,) = _LENGTH.unpack_from(data, place + _CHUNK.size + words)
+    return int(_CHUNK.size + words + _LENGTH.size + stored)
+
+
+def is_well_formed(data: _Bytes, place: int) -> bool:
+    """Whether a record begins there that has the form of its type, so far as that can be seen without a checksum."""
+    length = frame_length(data, place)
+    if place + length > len(data) or length > MAX_RECORD:
+        return False
+    kind = _KINDS.get(data[place])
+    if kind is None:
+        return False
+    if kind is Chunk:
+        return chunk_length(data, place) == length
+    frame = Frame(data[place], place, b"", data[place + _FRAME.size : place + length])
+    try:
+        if kind is MessageIndex:
+            check_message_index(frame)
+        else:
+            parse(kind, frame)
+    except Damage:
+        return False
+    return True
 
 
 def read_at(file: BinaryIO, position: int, length: int) -> bytes:

@@ -8,8 +8,8 @@ from typing import Any
 
 from zfusion import keys
 from zfusion.errors import MessageError
-from zfusion.gaps import GapCounter, Gaps
-from zfusion.messages import read_stamp
+from zfusion.gaps import Gaps
+from zfusion.recording.accounts import Accounts
 from zfusion.recording.layout import CHECKSUM
 from zfusion.recording.provenance import PACKAGES
 from zfusion.recording.reader import Recording
@@ -53,6 +53,10 @@ class RecordingInfo:
     """All else that is known of how it began: the machine, its clocks, what the recorder was told."""
     closing: Mapping[str, str]
     """The facts of how it ended."""
+    files: tuple[str, ...]
+    """Where it is: one file, or its segments."""
+    derived: Mapping[str, str]
+    """How it was recovered, merged or cut from others; empty if it was not."""
 
     @property
     def duration_ns(self) -> int:
@@ -94,6 +98,8 @@ def info(recording: Recording) -> RecordingInfo:
         versions=versions,
         facts={name: value for name, value in facts.items() if name not in shown},
         closing=dict(recording.closing),
+        files=tuple(map(str, recording.files)),
+        derived=dict(recording.derived),
     )
 
 
@@ -106,12 +112,7 @@ def _topic_info(topic: str, messages: int, gaps: Gaps) -> TopicInfo:
 
 
 def _count_gaps(recording: Recording) -> dict[str, Gaps]:
-    counters = {topic: GapCounter() for topic in recording.topics}
+    accounts = Accounts()
     for record in recording.records():
-        try:
-            stamp = read_stamp(record.data)
-        except MessageError:
-            counters[record.topic].observe_unreadable()
-        else:
-            counters[record.topic].observe(stamp.born, stamp.seq)
-    return {topic: counter.gaps() for topic, counter in counters.items()}
+        accounts.observe(record.topic, record.data)
+    return accounts.gaps()

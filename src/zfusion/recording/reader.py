@@ -1,171 +1,107 @@
-"""Reading a recording, finished or broken off.
-
-Opening proves the whole file: a finished one by the checksums of its data section and summary (which cover every
-byte), one that was broken off by the checksum of every chunk. So what is not what the writer wrote is refused before
-anything is done with it. A file that merely ends too early is read as far as it goes, and says so.
-"""
+"""Reading a recording, whether it is in one file or in several, finished or broken off."""
 
 from __future__ import annotations
 
-import json
 import os
-import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, NamedTuple, Self
+from typing import Self
 
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Metadata, Schema, Statistics
-
-from zfusion.errors import RecordingError
 from zfusion.gaps import Gaps
 from zfusion.recording import layout
-from zfusion.recording.container import (
-    MAGIC,
-    Damage,
-    Frame,
-    check_message_index,
-    chunk_channels,
-    chunk_messages,
-    frames,
-    parse,
-    parse_attachment,
-    read_at,
-    unpack_chunk,
-)
+from zfusion.recording.channels import Description
+from zfusion.recording.file import EVER, Record, RecordedFile, TooShort
 
-_EVER = 2**64
-"""Later than every time that an MCAP file can say."""
-
-
-class Record(NamedTuple):
-    """One recorded message."""
-
-    topic: str
-    """The Zenoh key that it came on."""
-    data: bytes
-    """The wire bytes."""
-    log_time_ns: int
-    """When the recorder got it; never less than the record's before."""
-    publish_time_ns: int
-    """When the sender sent it, by its own clock."""
-    sequence: int
-    """The sender's counter mod 2^32."""
-
-
-class _ChunkPlace(NamedTuple):
-    position: int
-    """Of the body, in the file."""
-    length: int
-    start_ns: int
-    """Lowest log time in it."""
-    end_ns: int
-    """Highest log time in it."""
-
-
-@dataclass(slots=True)
-class _Contents:
-    """What is found in a file from its beginning to its end."""
-
-    chunks: list[_ChunkPlace] = field(default_factory=list)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    channels: dict[int, str] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages of each channel."""
-    start_ns: int = 0
-    end_ns: int = 0
-    readable: int = 0
-    """Bytes until the end of the last record that is whole."""
-    data_ended: bool = False
-    """The writer had no more to say: all messages are there."""
-    proven: bool = False
-    """Data section and summary have checksums, and they agree."""
-    finished: bool = False
-    """The file is whole to its last byte."""
+__all__ = ["Record", "Recording"]
 
 
 class Recording:
-    """A recording, open for reading. A context manager; made by `Recording.open`.
+    """A recording, open for reading. A context manager; made by `Recording.open`."""
 
-    It reads one file with any number of iterations at once. A file that is still being written is read up to where
-    it was flushed when it was opened.
-    """
-
-    def __init__(self, path: Path, file: BinaryIO, contents: _Contents, size: int) -> None:
-        self._file = file
-        self._contents = contents
+    def __init__(self, path: Path, files: Sequence[RecordedFile], notes: Iterable[str] = ()) -> None:
+        """Of `files` that follow each other; `notes` say what is wrong with that."""
+        first, last = files[0], files[-1]
+        self._files = files
         self.path = path
-        self.size_bytes = size
-        self.complete = contents.finished
-        """False for a recording that was broken off; `note` says what is there and what is not."""
-        self.note = "" if contents.finished else _note(contents, size)
-        self.metadata: Mapping[str, str] = contents.metadata[layout.RECORDING]
+        self.files = tuple(file.path for file in files)
+        """Where it is: one file, or its segments."""
+        self.size_bytes = sum(file.size_bytes for file in files)
+        notes = [*(note for file in files for note in (file.note, file.derived.get("note", ""))), *notes]
+        if layout.STOPPED in last.closing:
+            notes.append(f"stopped before the run ended: {last.closing[layout.STOPPED]}")
+        self.note = "; ".join(filter(None, notes))
+        """What is not on it, of a recording that is not complete."""
+        self.complete = not self.note
+        """False for a recording that was broken off, or is a part only."""
+        self.metadata: Mapping[str, str] = first.metadata
         """The facts of `zfusion.recording`: run, method, seed, versions, machine, clocks."""
-        self.closing: Mapping[str, str] = contents.metadata.get(layout.CLOSE, {})
+        self.closing: Mapping[str, str] = last.closing
         """The facts of `zfusion.close`: how the recording ended; empty for one that was broken off."""
-        self.scenario_toml = contents.attachments[layout.SCENARIO].decode()
-        self.design = contents.attachments.get(layout.DESIGN)
+        self.derived: Mapping[str, str] = first.derived
+        """How it was made from other recordings; empty if it was not."""
+        self.scenario_toml = first.scenario_toml
+        self.design = first.design
         """What the file of the method's design held; None where it has none, or nobody attached it."""
         self.topics: Mapping[str, int] = {
-            topic: contents.counts.get(channel, 0) for channel, topic in sorted(contents.channels.items())
+            topic: sum(file.topics.get(topic, 0) for file in files)
+            for topic in dict.fromkeys(topic for file in files for topic in file.topics)
         }
         """Messages of every topic, in the order in which the topics first appeared."""
+        self.descriptions: Mapping[str, Description] = {
+            topic: of for file in reversed(files) for topic, of in file.descriptions.items()
+        }
+        """What the files say of the topics."""
         self.messages = sum(self.topics.values())
-        self.start_ns = contents.start_ns
+        times = [(file.start_ns, file.end_ns) for file in files if any(file.topics.values())] or [(0, 0)]
+        self.start_ns = times[0][0]
         """Log time of the first message; 0 if there is none."""
-        self.end_ns = contents.end_ns
+        self.end_ns = times[-1][1]
         """Log time of the last message; 0 if there is none."""
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
-        """The recording in the file at `path`; RecordingError, naming the file, if it cannot be read or trusted."""
+        """The recording that begins in the file at `path`, with the segments that follow it.
+
+        If that file was removed to make room for later ones, the first that is there. RecordingError, naming the
+        file, if one cannot be read or trusted.
+        """
         path = Path(path)
+        there = path
+        if not path.exists():
+            there = min(_later_segments(path), default=(0, path))[1]
+        files = [RecordedFile.open(there)]
+        notes = []
         try:
-            file = path.open("rb")
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-        try:
-            size = os.fstat(file.fileno()).st_size
-            contents = _survey(file, size)
-            _check_layout(contents)
-            return cls(path, file, contents, size)
-        except (RecordingError, UnicodeDecodeError, OSError) as error:
-            file.close()
-            raise RecordingError(f"{path}: {error}") from error
+            if files[0].number and (there != path or layout.PREVIOUS in files[0].metadata):
+                notes.append(f"begins with segment {files[0].number}: the ones before are not here")
+            notes += _follow(files)
+        except BaseException:
+            for file in files:
+                file.close()
+            raise
+        return cls(path, files, notes)
 
     @property
     def statistics(self) -> Mapping[str, Gaps] | None:
         """The writer's account of every topic; None for a recording that was broken off."""
-        stated = self._contents.metadata.get(layout.STATISTICS)
-        if stated is None or not self.complete:
-            return None
-        return {topic: Gaps(**json.loads(account)) for topic, account in stated.items()}
+        return self._files[-1].statistics
 
-    def records(self, topics: Iterable[str] | None = None, start_ns: int = 0, end_ns: int = _EVER) -> Iterator[Record]:
+    def records(self, topics: Iterable[str] | None = None, start_ns: int = 0, end_ns: int = EVER) -> Iterator[Record]:
         """The messages in the order in which they came, from `start_ns` up to but not including `end_ns` (log time).
 
-        `topics` leaves out all others. RecordingError if the file has changed since it was opened.
+        `topics` leaves out all others. RecordingError if a file has changed since it was opened. Any number of
+        iterations may go on at once.
         """
         chosen = None if topics is None else set(topics)
-        wanted = {
-            channel: topic if chosen is None or topic in chosen else None
-            for channel, topic in self._contents.channels.items()
-        }
-        try:
-            for chunk in self._contents.chunks:
-                if self._contents.proven and (chunk.end_ns < start_ns or chunk.start_ns >= end_ns):
-                    continue
-                _, data = unpack_chunk(read_at(self._file, chunk.position, chunk.length), chunk.position)
-                yield from map(Record._make, chunk_messages(data, chunk.position, wanted, start_ns, end_ns))
-        except Damage as error:
-            raise RecordingError(f"{self.path}: {error}") from error
+        for file in self._files:
+            yield from file.records(chosen, start_ns, end_ns)
 
     def close(self) -> None:
-        """Close the file; iterations that are under way end with an error."""
-        self._file.close()
+        """Close the files; iterations that are under way end with an error."""
+        for file in self._files:
+            file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -176,136 +112,43 @@ class Recording:
         self.close()
 
 
-def _survey(file: BinaryIO, size: int) -> _Contents:
-    """Read the file from end to end, prove it, and list what is in it."""
-    magic = file.read(len(MAGIC))
-    if not size:
-        raise RecordingError("is empty")
-    if magic != MAGIC:
-        raise RecordingError("is not an MCAP file")
-    file.seek(max(size - len(MAGIC), 0))
-    ends_well = size > len(MAGIC) and file.read() == MAGIC
-    contents = _Contents(readable=len(MAGIC))
-    records = frames(file, size, ends_well)
-    data_proven = _read_data(records, contents)
-    summary_proven = _read_summary(records, contents, file)
-    if ends_well and not contents.finished:
-        raise Damage(contents.readable, "the file ends as a finished one, but has no footer")
-    contents.proven = data_proven and summary_proven
-    if not contents.proven:
-        _count_messages(file, contents)
-    return contents
+def _follow(files: list[RecordedFile]) -> Iterator[str]:
+    """Append the segments that follow the first file; what is wrong with that, in words."""
+    first = layout.first_path(files[0].path, files[0].number)
+    while True:
+        last = files[-1]
+        following = layout.segment_path(first, last.number + 1)
+        promised = layout.NEXT in last.closing
+        if (last.finished and not promised) or layout.IDENTITY not in last.metadata:
+            return
+        try:
+            segment = RecordedFile.open(following) if following.exists() else None
+        except TooShort as error:
+            yield f"broken off: {error}"
+            return
+        if segment is None or not _belongs(segment, last):
+            if segment is not None:
+                segment.close()
+            if promised:
+                there = "not here" if segment is None else "of another recording"
+                yield f"it goes on in {following.name}, which is {there}"
+            return
+        files.append(segment)
 
 
-def _read_data(records: Iterator[Frame], contents: _Contents) -> bool:
-    """Take in the data section. True if it came to its end and its checksum agrees."""
-    checksum = zlib.crc32(MAGIC)
-    for frame in records:
-        contents.readable = frame.end
-        match frame.opcode:
-            case Opcode.CHUNK:
-                chunk = parse(Chunk, frame)
-                start = frame.position + len(frame.head)
-                contents.chunks.append(
-                    _ChunkPlace(start, len(frame.body), chunk.message_start_time, chunk.message_end_time)
-                )
-            case Opcode.MESSAGE_INDEX:
-                check_message_index(frame)
-            case Opcode.METADATA:
-                metadata = parse(Metadata, frame)
-                contents.metadata[metadata.name] = metadata.metadata
-            case Opcode.ATTACHMENT:
-                attachment = parse_attachment(frame)
-                contents.attachments[attachment.name] = attachment.data
-            case Opcode.CHANNEL:
-                _declare(contents, parse(Channel, frame), frame.position)
-            case Opcode.HEADER:
-                parse(Header, frame)
-            case Opcode.SCHEMA:
-                parse(Schema, frame)
-            case Opcode.DATA_END:
-                contents.data_ended = True
-                return _agree(parse(DataEnd, frame).data_section_crc, checksum, frame.position, "data section")
-            case _:
-                raise Damage(frame.position, f"a record of type {frame.opcode} among the data")
-        checksum = zlib.crc32(frame.body, zlib.crc32(frame.head, checksum))
-    return False
-
-
-def _read_summary(records: Iterator[Frame], contents: _Contents, file: BinaryIO) -> bool:
-    """Take in the summary section. True if it came to its end and its checksum agrees."""
-    checksum = 0
-    for frame in records:
-        contents.readable = frame.end
-        if frame.opcode == Opcode.FOOTER:
-            checksum = zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, checksum))
-            file.seek(frame.end)
-            rest = file.read(len(MAGIC) + 1)
-            if not MAGIC.startswith(rest):
-                raise Damage(frame.end, "something follows the footer")
-            contents.finished = rest == MAGIC
-            return _agree(parse(Footer, frame).summary_crc, checksum, frame.position, "summary")
-        checksum = zlib.crc32(frame.body, zlib.crc32(frame.head, checksum))
-        if frame.opcode == Opcode.CHANNEL:
-            _declare(contents, parse(Channel, frame), frame.position)
-        elif frame.opcode == Opcode.STATISTICS:
-            statistics = parse(Statistics, frame)
-            contents.counts = statistics.channel_message_counts
-            contents.start_ns, contents.end_ns = statistics.message_start_time, statistics.message_end_time
-    return False
-
-
-def _agree(stated: int, computed: int, position: int, what: str) -> bool:
-    """Whether a checksum is there (0 says that it is not) and right; Damage if it is there and wrong."""
-    if stated not in (0, computed):
-        raise Damage(position, f"the checksum of the {what} does not agree")
-    return stated != 0
-
-
-def _declare(contents: _Contents, channel: Channel, position: int) -> None:
-    if contents.channels.setdefault(channel.id, channel.topic) != channel.topic:
-        raise Damage(position, f"channel {channel.id} is declared twice")
-
-
-def _count_messages(file: BinaryIO, contents: _Contents) -> None:
-    """Prove every chunk of a file that has no checksum as a whole, and count what is in it."""
-    contents.counts, times = {}, [0, 0]
-    for place in contents.chunks:
-        _, data = unpack_chunk(read_at(file, place.position, place.length), place.position)
-        for channel in chunk_channels(data, place.position):
-            _declare(contents, channel, place.position)
-        numbers: dict[int, str | None] = {number: str(number) for number in contents.channels}
-        for number, _, log_time, _, _ in chunk_messages(data, place.position, numbers, 0, _EVER):
-            contents.counts[int(number)] = contents.counts.get(int(number), 0) + 1
-            times = [times[0] or log_time, log_time]
-    contents.start_ns, contents.end_ns = times
-
-
-def _check_layout(contents: _Contents) -> None:
-    """Refuse a file that is none of ours, or of another version, or that broke off before it had begun."""
-    facts = contents.metadata.get(layout.RECORDING)
-    if facts is None:
-        if not contents.finished:
-            raise RecordingError(f"ends at byte {contents.readable}, before it says what it is: nothing can be read")
-        raise RecordingError("is an MCAP file, but not a recording of zfusion's")
-    if not layout.is_intact(facts):
-        raise RecordingError(f"damaged: the checksum of its {layout.RECORDING} does not agree")
-    if facts.get("format") != layout.FORMAT:
-        raise RecordingError(
-            f"is a recording of format {facts.get('format')}; this zfusion reads format {layout.FORMAT}"
-        )
-    if layout.SCENARIO not in contents.attachments:
-        raise RecordingError(f"has no {layout.SCENARIO}: it ends at byte {contents.readable}")
-
-
-def _note(contents: _Contents, size: int) -> str:
-    """What is and what is not in a recording that was broken off."""
-    messages = sum(contents.counts.values())
-    if contents.data_ended:
-        return f"broken off while it was finished: all {messages} messages are there, the summary is not"
-    cut = size - contents.readable
-    half = f", and {cut} bytes of a record that is not all there" if cut else ""
+def _belongs(segment: RecordedFile, before: RecordedFile) -> bool:
+    same = (layout.IDENTITY, "run", "method", "seed", "format")
     return (
-        f"broken off: it holds {messages} messages{half}. What came after the recorder's last flush is lost, and the "
-        "accounts of what was sent are missing"
+        segment.number == before.number + 1
+        and all(segment.metadata.get(fact) == before.metadata.get(fact) for fact in same)
+        and segment.scenario_toml == before.scenario_toml
     )
+
+
+def _later_segments(first: Path) -> Iterator[tuple[int, Path]]:
+    """The later segments that there are of a recording whose first one is not."""
+    name = re.compile(rf"{re.escape(first.stem)}\.([1-9]\d{{0,8}}){re.escape(first.suffix)}")
+    if first.parent.is_dir():
+        for path in first.parent.iterdir():
+            if found := name.fullmatch(path.name):
+                yield int(found[1]), path

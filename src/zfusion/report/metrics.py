@@ -76,6 +76,8 @@ def _of_nodes(run: str, told: Mapping[str, Status]) -> Iterator[Family]:
     yield _counter("node_steps", "Steps completed in the present life.", node, steps)
     fallbacks = {at: s.fallbacks for at, s in each.items()}
     yield _counter("node_fallbacks", "Estimates of neighbours that were left out.", node, fallbacks)
+    jumps = {at: s.clock_jumps for at, s in each.items()}
+    yield _counter("node_clock_jumps", "Jumps of the node's clock.", node, jumps)
     for name, which in (("estimate", "x"), ("estimate_sd", "sd")):
         values = {
             (*at, str(number)): value

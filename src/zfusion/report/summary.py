@@ -34,6 +34,12 @@ HEADINGS = {"intermediate": "intermed."}
 """Stages by shorter names, so that the table fits into 80 columns."""
 
 
+TOLD_OF_RECORDER = ("files", "unrecorded", "overrun", "foreign", "stopped")
+"""Of its report."""
+
+CLOCK_COUNTERS = ("clock_jumps", "clock_offset_exceeded")
+"""Of the nodes' reports."""
+
 LATE_FATES = {"revised": "taken in", "too_late": "beyond the window", "stale": "of no use any more"}
 """What becomes of late messages where nodes revise, in words."""
 
@@ -74,12 +80,11 @@ def summarize(
     """The summary as plain data: what ``--json`` prints.
 
     run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
-    revised, too_late, stale (`EdgeCounters`), refused and incidents by name,
+    revised, too_late, stale (`EdgeCounters`), refused and incidents by name, clock_jumps and clock_offset_exceeded,
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
-    recording; the verdict on each edge, with its latencies and budget; rounds {node} (`latency.of_node`); what link
-    emulation did (emulated), what was planned to go wrong (faults), and what a network of namespaces did (network);
-    notes: what a user of the method must know of every run.
+    recording, recorder (`RecorderReport`); the verdict on each edge, with its latencies and budget; rounds {node}
+    (`latency.of_node`); emulated, faults, network: what links, plans and network namespaces did; notes on the method.
     """
     lives = [report for of_node in reports.values() for report in of_node]
     sent: Counter[str] = Counter()
@@ -95,14 +100,7 @@ def summarize(
         "steps": scenario.steps,
         "completed_steps": {str(i): sum(r.completed for r in reports.get(i, ())) for i in scenario.ids},
         "messages": {"sent": dict(sent), "recorded": dict(recorder.recorded) if recorder else {}},
-        "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
-        "late": sum(edge.late for edge in edges),
-        **{kind: _of_all_edges(lives, kind) for kind in LATE_FATES},
-        "missed": sum(edge.missed for edge in edges),
-        "refused": _refused(lives),
-        "fallbacks": sum(report.fallbacks for report in lives),
-        "incidents": _incidents(lives),
-        "skipped": sum(report.skipped for report in lives),
+        **_counted(lives, edges, recorder),
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
         "latency_us": _quantiles(report.latency for report in lives),
@@ -118,6 +116,7 @@ def summarize(
         "estimates": {str(i): lives[-1].estimate for i, lives in reports.items() if lives},
         "recording": recorder.path if recorder else None,
         "lost_on_recording": dict(recorder.lost) if recorder else {},
+        "recorder": {name: getattr(recorder, name) for name in TOLD_OF_RECORDER} if recorder else {},
         "edges": [asdict(edge) for edge in edges],
         "rounds": {str(i): of_node(lives) for i, lives in reports.items()},
         "emulated": emulated(reports),
@@ -127,6 +126,21 @@ def summarize(
         "failures": list(failures),
         "logs": logs,
         "network": network,
+    }
+
+
+def _counted(lives: Sequence[NodeReport], edges: Sequence[Edge], recorder: RecorderReport | None) -> dict[str, Any]:
+    """What was lost, late, refused or left out, in all."""
+    return {
+        "lost": sum(edge.lost for edge in edges) + sum(recorder.lost.values() if recorder else ()),
+        "late": sum(edge.late for edge in edges),
+        **{kind: _of_all_edges(lives, kind) for kind in LATE_FATES},
+        "missed": sum(edge.missed for edge in edges),
+        "refused": _refused(lives),
+        "fallbacks": sum(report.fallbacks for report in lives),
+        "incidents": _incidents(lives),
+        "skipped": sum(report.skipped for report in lives),
+        **{name: sum(getattr(report, name) for report in lives) for name in CLOCK_COUNTERS},
     }
 
 
@@ -316,6 +330,10 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
     if recorded:
         missing = sum(summary["lost_on_recording"].values())
         console.print(f"recorded: {sum(recorded.values())} messages, {missing} missing")
+        reasons = {"not written": "unrecorded", "too much for the recorder": "overrun"}
+        dropped = [f"{summary['recorder'][of]} {what}" for what, of in reasons.items() if summary["recorder"].get(of)]
+        if dropped:
+            console.print(f"  of these: {', '.join(dropped)}")
     trouble = {name: summary[name] for name in ("lost", "late", "missed", "fallbacks", "skipped")}
     trouble |= {f"late but {said}": summary[kind] for kind, said in LATE_FATES.items() if summary[kind]}
     console.print(", ".join(f"{count} {name}" for name, count in trouble.items()))
@@ -329,6 +347,11 @@ def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
         console.print(
             f"{summary['rounds_per_s']:.1f} steps/s; measurement to estimate "
             f"{latency['p50']:.0f} µs (p50), {latency['p99']:.0f} µs (p99)"
+        )
+    if summary["clock_jumps"] or summary["clock_offset_exceeded"]:
+        console.print(
+            f"clocks: {summary['clock_jumps']} jumps seen by nodes; "
+            f"{summary['clock_offset_exceeded']} readings of neighbours' beyond the limit"
         )
     _show_misfortune(console, summary)
     show_latencies(console, summary, HEADINGS)

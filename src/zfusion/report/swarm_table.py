@@ -96,6 +96,7 @@ def _node(node: SeenNode) -> dict[str, Any]:
         "born": status.born,
         "completed": status.completed,
         "fallbacks": status.fallbacks,
+        "clock_jumps": status.clock_jumps,
         "estimate": dict(status.estimate),
         "zfusion": status.zfusion,
         "fingerprint": status.fingerprint,

@@ -93,4 +93,6 @@ class LiveTable:
             lines.append(Text(f"... and {len(nodes) - len(shown)} more nodes"))
         if recorder is not None:
             lines.append(Text(f"recorded: {recorder.status.get('messages', 0)} messages"))
+            if recorder.status.get("stopped"):
+                lines.append(Text(f"recording stopped: {recorder.status['stopped']}", style="bold red"))
         return Group(*lines)

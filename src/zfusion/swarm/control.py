@@ -32,14 +32,27 @@ class ChildEnd:
     def __init__(self, descriptor: int) -> None:
         self._socket = socket.socket(fileno=descriptor)
         self._lock = threading.Lock()
+        self._unsent = b""
 
     def tell(self, **message: object) -> None:
-        """Send a message; nothing happens where the launcher is gone."""
+        """Send a message; nothing happens where the launcher is gone.
+
+        A status is not sent while the line is full of older ones: a launcher that stands still is not to hold up its
+        swarm. Everything else waits for room.
+        """
         with self._lock:
             try:
-                self._socket.sendall(json.dumps(message).encode() + b"\n")
-            except OSError:
+                if "status" not in message:
+                    self._socket.sendall(self._unsent + json.dumps(message).encode() + b"\n")
+                    self._unsent = b""
+                    return
+                if not self._unsent:
+                    self._unsent = json.dumps(message).encode() + b"\n"
+                self._unsent = self._unsent[self._socket.send(self._unsent, socket.MSG_DONTWAIT) :]
+            except BlockingIOError:  # the line is full
                 return
+            except OSError:
+                self._unsent = b""
 
     def on_stop(self, stop: Callable[[], None], hear: Callable[[Mapping[str, Any]], None] = lambda _: None) -> None:
         """Have `stop` called, from another thread, when the launcher says so or is gone; `hear`, what else it says."""
@@ -98,10 +111,11 @@ class LauncherEnd:
         self.socket.close()
 
 
-def die_with_parent() -> None:
-    """Have the kernel kill this process when the one that started it dies (Linux; elsewhere the line's end must do).
+def on_death_of_parent(what: signal.Signals) -> None:
+    """Have the kernel signal this process when the one that started it dies (Linux; elsewhere the line's end must do).
 
-    For processes that may be stopped or stuck when that happens, and have nothing to save.
+    For processes that may be stopped or stuck when that happens: SIGKILL for those that have nothing to save, SIGCONT
+    for those that have.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, what)

@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
 from zfusion.drivers.endpoints import dialled
 from zfusion.drivers.metrics import NodeReport, RecorderReport
@@ -28,6 +29,7 @@ from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.swarm.control import LauncherEnd
 from zfusion.swarm.netns.addresses import places
+from zfusion.swarm.standstill import STANDSTILL_S, Standstill, is_stopped
 
 STOP_S = 15.0
 """How long a process that was told to stop may take: a node waits some seconds for its neighbours to hear it out."""
@@ -43,6 +45,9 @@ MAX_RESTARTS = 10
 
 TAIL_LINES = 15
 """Last lines of a failed process's log that are shown."""
+
+TAIL_BYTES = 65_536
+"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
 
 PORTS = range(20_000, 32_000)
 """Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
@@ -74,6 +79,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    health: Mapping[str, Any] = field(default_factory=dict)
+    """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
     told: bool = False
     """Whether it has reported on its present life."""
@@ -118,6 +125,8 @@ class LaunchOptions:
     restart: bool = False
     netns: str | None = None
     """Have every node in a network namespace of its own, joined by "tun", "netem" or what of them is best: "auto"."""
+    health_s: float = 0.0
+    """How often every node tells of its health; 0: never."""
     on_update: Callable[[Mapping[NodeId, Child], Child | None], None] | None = None
     """Called about ten times a second with the nodes' processes and the recorder's."""
     on_message: Callable[[str], None] = lambda _: None
@@ -134,6 +143,9 @@ class Launcher:
         self._failures: list[str] = []
         self._interrupts = 0
         self._stop_by: float | None = None
+        self._clock = Clock()
+        self._clock.keep()
+        self._standstill = Standstill()
         self._begun = False
         """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
@@ -162,6 +174,7 @@ class Launcher:
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
+            self._note_unrecorded()
         finally:
             self._kill(self._everybody())
             self._selector.close()
@@ -196,6 +209,8 @@ class Launcher:
                 command.append("--await-recorder")
             if self._network is not None:
                 command.append("--no-emulation")
+            if options.health_s:
+                command += ["--health", str(options.health_s)]
             nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
         recorder = None
         if options.recording is not None:
@@ -248,6 +263,7 @@ class Launcher:
         self._start(network)
         while network.running and not network.status and not self._interrupts:
             self._look_after_all()
+            self._give_up_stopped()
         if self._interrupts:
             self._stop_nodes()
         elif network.status:
@@ -273,7 +289,7 @@ class Launcher:
         line.child.close()
         if child.node is not None:
             _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.told = None, None, {}, False
+        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _entrance(self, child: Child) -> Sequence[str]:
@@ -287,6 +303,7 @@ class Launcher:
         """Until every node's process has ended for good, or will not."""
         while any(child.running for child in self._nodes.values()):
             self._look_after_all()
+            self._give_up_stopped()
             self._dismiss_latecomers()
             if self._interrupts and self._stop_by is None:
                 self._options.on_message("stopping (once more kills)")
@@ -307,7 +324,22 @@ class Launcher:
                 if child.line is not None:
                     child.line.stop()
 
+    def _give_up_stopped(self) -> None:
+        """End processes that somebody has stopped, where the run can only wait for them, and has for too long."""
+        awaited = self._nodes.values() if self._begun else self._everybody()
+        running = {c.name: c for c in awaited if c.running and c.blow is None}
+        processes = {name: c.process.pid for name, c in running.items() if c.process is not None}
+        for name in self._standstill.overdue(processes, begun=self._begun):
+            self._failures.append(
+                f"{name} was stopped{_step(running[name])} and not set going within {STANDSTILL_S:g} s: killed"
+            )
+            self._options.on_message(self._failures[-1])
+            self._kill([running[name]])
+            if not self._begun:
+                self._stop_nodes()
+
     def _look_after_all(self) -> None:
+        self._clock.look()
         for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
         for child in self._everybody():
@@ -322,6 +354,8 @@ class Launcher:
             if "status" in message:
                 child.status = message["status"]
                 self._note_beginning(child.status)
+            elif "health" in message:
+                child.health = message["health"]
             elif "blow" in message:
                 self._note_blow(child, message["blow"])
                 child.reports += [message["report"]] if message["report"] else []
@@ -387,7 +421,7 @@ class Launcher:
                 child.blow = None
                 child.restarts += 1
                 self._start(child)
-            elif child.process is not None and is_stopped(child.process.pid):
+            elif child.process is not None and is_stopped(child.process.pid) is not False:
                 child.blow = None
                 child.process.send_signal(signal.SIGCONT)
             else:
@@ -397,7 +431,7 @@ class Launcher:
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
         if blow["until_ns"] is not None:
-            left: float = (blow["until_ns"] - time.time_ns()) / 1e9
+            left: float = (blow["until_ns"] - self._clock.now()) / 1e9
             return left
         others = [other for other in self._nodes.values() if other is not child and other.running]
         reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
@@ -418,7 +452,9 @@ class Launcher:
         )
 
     def _tail(self, child: Child) -> str:
-        lines = child.log.read_text(errors="replace").splitlines()[-TAIL_LINES:]
+        with child.log.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
         return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
@@ -446,6 +482,12 @@ class Launcher:
         if self._recorder is None or not self._recorder.reports:
             return None
         return RecorderReport(**self._recorder.reports[-1])
+
+    def _note_unrecorded(self) -> None:
+        """A swarm goes on without its recording, but it has not been recorded as it was to be."""
+        report = self._recorder_report()
+        if report is not None and report.stopped:
+            self._failures.append(f"{report.stopped}: {report.unrecorded} messages are not on the recording")
 
     def _network_report(self) -> Mapping[str, Any] | None:
         """What it told at its end; of one that died before, what it was."""
@@ -504,14 +546,6 @@ def _own_ports() -> Iterator[int]:
 
 
 _ports = _own_ports()
-
-
-def is_stopped(pid: int) -> bool:
-    """Whether a process stands still, by a signal."""
-    state = Path(f"/proc/{pid}/stat")
-    if not state.exists():
-        return sys.platform != "linux"  # where that cannot be seen, it is taken at its word
-    return state.read_text().rpartition(")")[2].split()[0] == "T"
 
 
 def _let_finish(pid: int) -> None:

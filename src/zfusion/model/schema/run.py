@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, PlainValidator, model_validator
 
 from zfusion.errors import Problem
-from zfusion.model.schema.base import Flag, Id, Number, Options, Positive, Spec
+from zfusion.model.schema.base import Flag, Id, Natural, NotNegative, Number, Options, Positive, Spec
 from zfusion.model.schema.problems import Faults
 from zfusion.model.types import NodeId
 
@@ -19,6 +19,9 @@ LARGEST_WINDOW = 15
 """Steps that a message may be late under the policy "revise": a node keeps the states of so many."""
 DEFAULT_DEADLINES: Mapping[str, float] = {"measurement": 0.45, "intermediate": 0.9}
 """Fractions of the period until which a stage's messages are waited for."""
+
+LEAST_SEGMENT = 10_000
+"""Bytes of a recording's file below which it would hold little but what it says of itself."""
 
 NANOSECONDS = 1_000_000_000
 
@@ -63,6 +66,9 @@ class TimingSpec(Spec):
     `late` says what becomes of messages that are: they are not used (drop); they are not used in time, but taken in as
     long as they are within the `window` (revise); or there is no such thing, as a stage waits for all that it expects,
     for up to `timeout_s` (wait).
+
+    The clocks of two neighbours may be `max_clock_offset_s` apart, by default a quarter of the shortest time that a
+    stage is open; a node that finds more refuses to begin, or says so (`on_clock_offset`).
     """
 
     rate_hz: Positive | None = None
@@ -72,6 +78,8 @@ class TimingSpec(Spec):
     late: Literal["drop", "revise", "wait"] = "drop"
     window: Annotated[int, Field(strict=True, ge=1, le=LARGEST_WINDOW)] = 8
     epoch: Annotated[datetime, PlainValidator(_epoch)] | None = None
+    max_clock_offset_s: Positive | None = None
+    on_clock_offset: Literal["refuse", "warn"] = "refuse"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -266,6 +274,12 @@ class TransportSpec(Spec):
     zenoh_config: str | None = None
 
 
+def _segment_bytes(value: int) -> int:
+    if 0 < value < LEAST_SEGMENT:
+        raise ValueError(f"expected {LEAST_SEGMENT} or more, or 0 for one file of any size")
+    return value
+
+
 class RecordingSpec(Spec):
     """What becomes of the run's messages: an MCAP file at `path`, or in `directory` under the run's name."""
 
@@ -276,6 +290,14 @@ class RecordingSpec(Spec):
     directory: str | None = None
     flush_interval_s: Positive = 1.0
     compression: Literal["zstd", "lz4", "none"] = "zstd"
+    rotate_bytes: Annotated[Natural, AfterValidator(_segment_bytes)] = 1 << 30
+    rotate_s: NotNegative = 3600.0
+    max_files: Natural = 0
+    min_free_bytes: Natural = 100_000_000
+    fsync_interval_s: NotNegative = 5.0
+    """Of these five, 0 means: not at all."""
+    when_full: Literal["drop", "wait"] | None = None
+    """Whether senders wait for a recorder that cannot follow. By default they do where the swarm runs freely only."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

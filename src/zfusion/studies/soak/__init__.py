@@ -1,0 +1,1 @@
+"""Long runs: whether anything grows that should not."""
