@@ -27,6 +27,7 @@ from zfusion.cli import (
     repair,
     report,
     soak,
+    supervision,
 )
 from zfusion.cli.common import err, out
 from zfusion.errors import ZfusionError
@@ -42,7 +43,7 @@ app = typer.Typer(
 COMMANDS = {
     "Run a swarm": (live.launch, live.simulate, live.node, live.record, soak.soak),
     "Look at it": (observe.status, observe.top, observe.echo, observe.hz, observe.metrics),
-    "On many machines": (deploy.deploy, deploy.router, doctor.doctor),
+    "On many machines": (deploy.deploy, deploy.router, supervision.health, doctor.doctor),
     "Predict and compare": (
         models.design,
         compare.compare,

@@ -8,6 +8,8 @@ import signal
 import sys
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from glob import escape
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,6 +128,13 @@ def default_directory(scenario: Scenario) -> Path:
     """Where recordings and logs go unless something else is said."""
     directory = scenario.recording.directory
     return (scenario.absolute(directory) if directory else Path("recordings")).absolute()
+
+
+def unused(path: Path) -> Path:
+    """`path`, or the first of ``field-2.mcap``, ``field-3.mcap``, ... of which there is no file, nor a part of one."""
+    names = chain((path.stem,), (f"{path.stem}-{n}" for n in count(2)))
+    name = next(name for name in names if not any(path.parent.glob(f"{escape(name)}.*")))
+    return path.with_name(f"{name}{path.suffix}")
 
 
 def node_named(scenario: Scenario, text: str) -> NodeId:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from zfusion.cli.common import Json, ScenarioFile, finish, load, on_signals, out
+from zfusion.cli.supervision import supervised
 
 
 def deploy(
@@ -19,15 +20,22 @@ def deploy(
     renew: Annotated[bool, typer.Option("--renew", help="Make all certificates anew, under the same CA.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write a folder for every host: Zenoh configurations, certificates and keys, access control, and the scenario."""
+    """Write a folder for every host: scenario, Zenoh configurations, certificates and keys, access control, units."""
+    from zfusion.deploy.compose import write_compose
     from zfusion.deploy.folders import write
     from zfusion.deploy.hosts import HostsFile
     from zfusion.deploy.plan import Plan
+    from zfusion.deploy.systemd import write_units
     from zfusion.keys import check_run
 
     loaded = load(scenario)
     placed = HostsFile.load(hosts, loaded)
-    written = write(Plan(loaded, placed, check_run(placed.run or scenario.stem)), output, renew=renew)
+    written = write(
+        Plan(loaded, placed, check_run(placed.run or scenario.stem)),
+        output,
+        renew=renew,
+        more=(write_units, write_compose),
+    )
 
     def show() -> None:
         for name in written.folders:
@@ -46,6 +54,8 @@ def router(
     """Run a Zenoh router, where there is no zenohd: the same configuration works with either. Ends with Ctrl-C."""
     from zfusion.drivers.router import Router
 
-    running = Router(zenoh_config)
-    on_signals(running.stop)
-    running.run()
+    with supervised() as supervisor:
+        running = Router(zenoh_config)
+        on_signals(running.stop)
+        supervisor.ready("routing")
+        running.run()

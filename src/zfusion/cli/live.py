@@ -37,11 +37,12 @@ from zfusion.cli.common import (
     node_named,
     on_signals,
     out,
-    plain,
     recording_path,
     run_name,
+    unused,
 )
 from zfusion.cli.progress import design_first
+from zfusion.cli.supervision import supervised, teller
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import NodeId
@@ -202,7 +203,7 @@ def node(
     from zfusion.report.summary import show_node_report
 
     control = control_of(control_fd, deadly=True)
-    with ToldTo(control):
+    with ToldTo(control), supervised(control) as supervisor:
         loaded = load(scenario, steps, rate, free_run, seed, method, zenoh_config=zenoh_config)
         own = node_named(loaded, node_id)
         options = LiveOptions(
@@ -214,7 +215,7 @@ def node(
             emulate=emulation,
             health_s=0.0 if control is None else health,
         )
-        tell = None if control is None else lambda status: control.tell(status=plain(asdict(status)))
+        tell = teller(control, supervisor, supervisor.node)
 
         def announce(blow: Any) -> None:
             """Tell the launcher what fells the node, with its last report: it may not live to make another one."""
@@ -245,6 +246,9 @@ def record(
     connect: Connect = None,
     listen: Listen = None,
     zenoh_config: ZenohConfig = None,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Replace no recording: the new one's name gets a number.")
+    ] = False,
     network: Annotated[NetnsKind | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
     control_fd: ControlFd = None,
@@ -257,7 +261,7 @@ def record(
     from zfusion.recording import Keeping, RecordingWriter
 
     control = control_of(control_fd, deadly=False)
-    with ToldTo(control):
+    with ToldTo(control), supervised(control) as supervisor:
         as_written = load_scenario(scenario)
         loaded = as_written.with_overrides(zenoh_config=zenoh_config)
         name = given_run(run, loaded)
@@ -265,7 +269,7 @@ def record(
         method = loaded.method.name
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
-            output,
+            unused(output) if keep else output,
             scenario_toml=as_written.anchored().to_toml(),  # where keys are kept is nobody's business
             run=name,
             method=method,
@@ -275,7 +279,7 @@ def record(
             facts=None if network is None else {"network": network},
             keeping=Keeping.of(loaded.recording),
         )
-        tell = None if control is None else lambda report: control.tell(status=asdict(report))
+        tell = teller(control, supervisor, supervisor.recorder)
         endpoints = recorder_endpoints(loaded, connect, listen)
         recorder = Recorder(loaded, name, endpoints, writer, until_all_gone=control is None, tell=tell)
         on_signals(recorder.stop)

@@ -7,6 +7,8 @@
     identity   a small CA and a certificate for each process, or a user's own, checked
     bundle     the scenario with the data files that it names, to be read in another place
     folders    writes it all
+    systemd    service units for it
+    compose    a compose file for it
 
 The folders, for ``zfusion deploy field.toml --hosts hosts.toml -o out``:
 
@@ -20,6 +22,8 @@ The folders, for ``zfusion deploy field.toml --hosts hosts.toml -o out``:
         zenoh/PROCESS.json5        PROCESS is node-<id>, recorder, observer or router-<host>, as in the plan
         tls/ca.pem                 whom to believe
         tls/PROCESS.pem, .key      who it is: the common name is PROCESS
+        systemd/                   its units, and how to install them
+        compose.yaml               the same in containers
         recordings/                the recorder's, where there is one
 
 Directories that hold keys have mode 0700, keys 0600. All paths in the files are relative to ``out/HOST``.

@@ -7,7 +7,7 @@ never touched.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import join
@@ -50,9 +50,9 @@ class Written:
 
 
 def write(
-    plan: Plan, directory: Path, *, renew: bool = False, more: Callable[[Plan, Path], None] | None = None
+    plan: Plan, directory: Path, *, renew: bool = False, more: Iterable[Callable[[Plan, Path], None]] = ()
 ) -> Written:
-    """Write the folders of a plan's hosts into `directory`; `more` is called at the end, to write more into them.
+    """Write the folders of a plan's hosts into `directory`; `more` are called at the end, to write more into them.
 
     InputError where there is something else in it, a data file is missing, or a certificate is no good.
     """
@@ -78,8 +78,8 @@ def write(
         (folder / "README").write_text(_readme(plan, name))
     if identities is not None:
         written.certificates_made, written.certificates_kept = identities.made, identities.kept
-    if more is not None:
-        more(plan, directory)
+    for each in more:
+        each(plan, directory)
     return written
 
 

@@ -108,7 +108,7 @@ class Plan:
             case "router":
                 return ("zfusion", "router", *config)
             case "recorder":
-                return ("zfusion", "record", *common, "-o", f"{RECORDINGS}/{self.run}.mcap")
+                return ("zfusion", "record", *common, "-o", f"{RECORDINGS}/{self.run}.mcap", "--keep")
             case "observer":
                 return ("zfusion", "top", *common)
             case "sensor":
