@@ -7,6 +7,7 @@ object on standard output, everything else on standard error.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -40,7 +41,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-COMMANDS = {
+COMMANDS: dict[str, Sequence[Callable[..., None]]] = {
     "Run a swarm": (live.launch, live.simulate, live.node, live.record, soak.soak),
     "Look at it": (observe.status, observe.top, observe.echo, observe.hz, observe.metrics),
     "On many machines": (deploy.deploy, deploy.router, supervision.health, doctor.doctor),
