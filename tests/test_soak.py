@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import gc
+import struct
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import tomli_w
 import typer
 
 from swarms import EXAMPLE, run_name, zfusion
-from zfusion import used_sets
+from zfusion import gaps, used_sets
 from zfusion.cli.soak import duration_s
 from zfusion.drivers.simulated import Simulation
 from zfusion.errors import InputError
@@ -158,25 +160,27 @@ def test_what_is_no_samples_is_refused(tmp_path: Path) -> None:
         read_samples(tmp_path / "other.csv")
 
 
-def test_nothing_in_a_swarm_grows_with_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Less than one pointer a node and step, where whatever is kept of a step takes a pointer at least."""
+def test_nothing_in_a_swarm_grows_with_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Less than a number and a pointer to it a node and step: whatever is kept of a step takes that at least."""
     monkeypatch.setattr(used_sets, "KEPT_RUNS", 32)  # what is bounded is to reach its bounds before it is measured
     monkeypatch.setattr(neighbourhood, "COMBINATIONS", 16)
     monkeypatch.setattr(streams, "KEPT_ENDS", 2)
-    first, last = 300, 700
-    simulation = Simulation(load_scenario(EXAMPLE, steps=last + 10, loss=0.1))
-    period_ns = 50_000_000
+    monkeypatch.setattr(gaps, "MAX_HOLES", 8)
+    scenario = load_scenario(written(tmp_path, "lossy", timing={"rate_hz": 20.0}), steps=1600, loss=0.1)
+    warm, first, last = (
+        20 + n * BLOCK for n in (1, 3, 6)
+    )  # at the same place in a block: they fill, and are let go of
     tracemalloc.start()
     try:
-        sizes = []
-        for step in (first, last):
-            simulation.run(simulation.epoch_ns + step * period_ns)
+        simulation, sizes = Simulation(scenario), []
+        for step in (warm, first, last):
+            simulation.run(simulation.epoch_ns + step * 50_000_000)
             gc.collect()
             sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
     assert min(node.step for node in simulation.nodes.values()) >= last - 1
-    assert sizes[1] - sizes[0] < 4 * (last - first) * 8
+    assert sizes[2] - sizes[1] < len(scenario.ids) * (last - first) * (struct.calcsize("P") + sys.getsizeof(1.0))
 
 
 def test_what_was_forgotten_of_a_path_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,8 +217,8 @@ def test_holes_of_many_lives_are_not_all_remembered() -> None:
     for born in range(1, lives + 1):
         for n in range(each):
             counter.observe(born, 2 * n + 1)  # every other one is missing
-    gaps = counter.gaps()
-    assert (gaps.received, gaps.lost_before, gaps.lost_between) == (lives * each, lives, lives * (each - 1))
+    told = counter.gaps()
+    assert (told.received, told.lost_before, told.lost_between) == (lives * each, lives, lives * (each - 1))
     kept = sum(len(life.holes) for life in counter._lives.values())
     assert kept == LIVES_WITH_HOLES * each
     assert kept <= LIVES_WITH_HOLES * MAX_HOLES
