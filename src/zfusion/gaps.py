@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 MAX_LIVES = 1024
 """Lives of one sender that are told apart; a node is not restarted so often, a forger's messages are."""
 
-MAX_HOLES = 4096
+MAX_HOLES = 1024
 """Separate holes remembered in one life, for messages that come late; the oldest are given up for lost beyond that."""
 
 

@@ -7,6 +7,7 @@ object on standard output, everything else on standard error.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -40,36 +41,31 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (
-    live.launch,
-    live.simulate,
-    live.node,
-    live.record,
-    supervision.health,
-    observe.status,
-    observe.top,
-    observe.echo,
-    observe.hz,
-    observe.metrics,
-    deploy.deploy,
-    deploy.router,
-    doctor.doctor,
-    models.design,
-    compare.compare,
-    compare.worst,
-    experiment.experiment,
-    recordings.replay,
-    recordings.info,
-    recordings.export,
-    repair.recover,
-    repair.merge,
-    repair.cut,
-    report.report,
-    soak.soak,
-):
-    app.command()(command)
+COMMANDS: dict[str, Sequence[Callable[..., None]]] = {
+    "Run a swarm": (live.launch, live.simulate, live.node, live.record, soak.soak),
+    "Look at it": (observe.status, observe.top, observe.echo, observe.hz, observe.metrics),
+    "On many machines": (deploy.deploy, deploy.router, supervision.health, doctor.doctor),
+    "Predict and compare": (
+        models.design,
+        compare.compare,
+        compare.worst,
+        experiment.experiment,
+    ),
+    "Recordings": (
+        recordings.replay,
+        recordings.info,
+        report.report,
+        recordings.export,
+        repair.recover,
+        repair.merge,
+        repair.cut,
+    ),
+}
+for panel, commands in COMMANDS.items():
+    for command in commands:
+        app.command(rich_help_panel=panel)(command)
 app.command(hidden=True)(live.network)
-app.add_typer(library.app, name="library")
+app.add_typer(library.app, name="library", rich_help_panel="Studies")
 
 
 def run() -> None:
