@@ -15,6 +15,7 @@ import pytest
 
 from oracles.paper import ERROR_VARIANCES
 from zfusion.cli import run
+from zfusion.cli.common import unused
 
 ROOT = Path(__file__).parents[1]
 FOUR = str(ROOT / "examples" / "four_sensor.toml")
@@ -268,3 +269,14 @@ def test_a_published_replay_reaches_a_consumer_whole_and_in_order(simulated: Pat
         heard = [subscriber.recv() for _ in wanted]
         assert [(str(s.key_expr), s.payload.to_bytes()) for s in heard] == wanted
         subscriber.undeclare()
+
+
+def test_a_recording_that_is_kept_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "field.mcap"
+    assert unused(path) == path
+    (tmp_path / "field.1.mcap").touch()  # a part of it, whose first one is gone
+    assert unused(path) == tmp_path / "field-2.mcap"
+    (tmp_path / "field-2.mcap").touch()
+    assert unused(path) == tmp_path / "field-3.mcap"
+    (tmp_path / "fields.mcap").touch()
+    assert unused(tmp_path / "field-4.mcap") == tmp_path / "field-4.mcap"

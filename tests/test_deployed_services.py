@@ -21,7 +21,7 @@ from deployed import SPREAD, planned
 from namespaces import Hosts, hosts, why_none
 from services import Service, services_of, write_all
 from supervisors import Systemd
-from swarms import Command, run_name, wait_until, zfusion
+from swarms import ZFUSION, Command, run_name, wait_until, zfusion
 from zfusion.deploy.plan import Plan
 from zfusion.drivers.notify import Health
 
@@ -105,7 +105,7 @@ class Running:
                 environment["ZFUSION_HEALTH_FILE"] = str(place / f"{service.name}.run" / "health")
             settings = [f"{name}={value}" for name, value in environment.items()]
             entrance = (*made.entrance(service.host), *as_user(user), *settings)
-            command = self.commands[service.name] = Command(directory, *service.words, entrance=entrance)
+            command = self.commands[service.name] = Command(directory, *service.words, program=(*entrance, *ZFUSION))
             stack.callback(command.process.wait)
             stack.callback(command.process.kill)
 

@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from swarms import EXAMPLE, Result, estimates, launch, recorded, run_name, variant, zfusion
+from zfusion.swarm.launch import Child, latecomers
 
 STEPS = 300
 NODES = ["1", "2", "3", "4"]
@@ -215,3 +216,21 @@ def test_launchers_that_look_for_free_ports_at_the_same_time_find_different_ones
             process.communicate(timeout=60)
     assert [len(set(endpoints)) for endpoints in found] == [150, 150]
     assert not {*found[0]} & {*found[1]}
+
+
+def test_who_finds_nobody_to_join_any_more_is_not_waited_for() -> None:
+    def child(number: int, phase: str, *, ended: bool = False, restarts: int = 0) -> Child:
+        made = Child(f"node {number}", number, [], Path())
+        made.process = subprocess.Popen(["true"])
+        made.process.wait()
+        made.exit_code = 0 if ended else None
+        made.status, made.restarts = {"phase": phase}, restarts
+        return made
+
+    through, late = child(1, "done", ended=True), child(2, "joining")
+    assert latecomers([through, late]) == [late]
+    assert latecomers([child(1, "joining"), late]) == []  # they wait for each other
+    assert latecomers([through, late, child(3, "running")]) == []
+    assert latecomers([through, late, child(3, "done")]) == []  # which stays for whom it has not told all
+    again = child(3, "joining", restarts=1)
+    assert latecomers([through, again]) == [again]

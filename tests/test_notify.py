@@ -50,7 +50,7 @@ def test_a_failure_is_told_in_one_line(systemd: Systemd) -> None:
 
 def test_signs_of_life_while_the_main_thread_waits(tmp_path: Path) -> None:
     with Systemd(str(tmp_path / "notify")) as systemd:
-        with Supervisor.of({"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}):
+        with Supervisor.of({"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "100000"}):
             lock = threading.Lock()
             lock.acquire()
             lock.acquire(timeout=0.2)
@@ -70,6 +70,16 @@ def test_nobody_listening_ends_nothing(tmp_path: Path, caplog: pytest.LogCapture
     assert [record.getMessage() for record in caplog.records if "cannot tell" in record.getMessage()] == [
         "cannot tell how this process is doing: [Errno 2] No such file or directory"
     ]
+
+
+def test_what_could_not_be_told_is_told_later(tmp_path: Path) -> None:
+    address, file = str(tmp_path / "notify"), tmp_path / "health"
+    with Supervisor.of({"NOTIFY_SOCKET": address, "ZFUSION_HEALTH_FILE": str(file)}) as supervisor:
+        supervisor.ready("working")
+        assert Health.read(file).ready
+        with Systemd(address) as systemd:
+            supervisor.waiting("resting")
+            assert systemd.heard() == ["READY=1\nSTATUS=resting"]
 
 
 @pytest.mark.parametrize(
@@ -147,9 +157,11 @@ def test_a_node_tells_systemd_and_the_probe(tmp_path: Path, monkeypatch: pytest.
             assert Health.read(file).ready
             assert Health.read(file).pid == node.process.pid
             node.process.send_signal(signal.SIGSTOP)
-            wait_until(lambda: Health.read(file).age_s > 1.0, "a stopped process gives no signs of life")
+            wait_until(
+                lambda: systemd.heard() and Health.read(file).age_s > 1.0, "a stopped process gives no signs of life"
+            )
             node.process.send_signal(signal.SIGCONT)
-            wait_until(lambda: Health.read(file).age_s < 1.0, "it goes on")
+            wait_until(lambda: systemd.heard() and Health.read(file).age_s < 1.0, "it goes on")
             node.process.send_signal(signal.SIGTERM)
             wait_until(lambda: systemd.said("STOPPING=1"), "stopping")
             result = node.wait()

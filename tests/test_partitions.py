@@ -1,17 +1,12 @@
-"""Hosts that are cut off and come back, links that carry one way only, a router that dies and is started again.
+"""Hosts that are cut off and come back, and links that carry one way only.
 
     python -m pytest -m long tests/test_partitions.py
 
-Needs network namespaces, but for the router.
+Needs network namespaces.
 """
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -19,9 +14,8 @@ from typing import Any
 import pytest
 
 from exactness import Exactness
-from swarms import Command, Listener, client, decoded, launch, recorded, run_name, variant, wait_until, zfusion
+from swarms import launch, recorded, variant, zfusion
 from test_netns_swarm import TROUBLE
-from zfusion.swarm.launch import free_endpoints
 
 pytestmark = pytest.mark.long
 
@@ -60,68 +54,3 @@ def test_who_is_cut_off_is_missed_and_taken_back(tmp_path: Path, what: str) -> N
     missed = {(e["sender"], e["receiver"]): e["missed"] + e["lost"] for e in summary["edges"]}
     assert missed["2", "1"] > 0
     assert_right(tmp_path, tmp_path / "x.mcap")
-
-
-ROUTER = """
-import sys
-from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.transport import open_session
-with open_session(Endpoints(listen=(sys.argv[1],)), mode="router"):
-    print("ready", flush=True)
-    sys.stdin.read()
-"""
-
-
-@contextmanager
-def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    """A Zenoh router, until it is killed."""
-    words = [sys.executable, "-c", ROUTER, endpoint]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
-            yield process
-        finally:
-            process.kill()
-
-
-def wait_for_everybody(endpoint: str, run: str, command: Command, after: int) -> int:
-    """Until all nodes use all their neighbours at some step beyond one; that step."""
-    with client(endpoint) as session:
-        heard = Listener(session, f"zfusion/{run}/node/*/intermediate")
-
-        def full() -> set[int]:
-            at: dict[int, set[int]] = {i: set() for i in EVERYBODY}
-            for message in map(decoded, heard.collect()):
-                if message["step"] > after and message["used"] == EVERYBODY[message["node"]]:
-                    at[message["node"]].add(message["step"])
-            return set.intersection(*at.values())
-
-        wait_until(full, f"everybody is heard after step {after}\n{command.said()}")
-        return max(full())
-
-
-def test_a_router_that_is_killed_and_started_again(tmp_path: Path) -> None:
-    [endpoint] = free_endpoints(1)
-    retry = {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}
-    (tmp_path / "zenoh.json5").write_text(
-        json.dumps(
-            {
-                "mode": "client",
-                "connect": {"endpoints": [endpoint], "timeout_ms": -1, "exit_on_failure": False, "retry": retry},
-                "scouting": {"multicast": {"enabled": False}},
-            }
-        )
-    )
-    scenario = variant(tmp_path, "routed", transport={"zenoh_config": "zenoh.json5", "endpoints": {}}, **SLOW)
-    run, path = run_name("routed"), tmp_path / "x.mcap"
-    with router(endpoint):
-        command = Command(tmp_path, "launch", scenario, "--json", "--run", run, "--record", path, "--steps", 1_000_000)
-        step = wait_for_everybody(endpoint, run, command, 20)
-    with router(endpoint):
-        wait_for_everybody(endpoint, run, command, step)
-        command.interrupt()
-        result = command.wait()
-    assert result.code == 0, result.err
-    assert result.summary["failures"] == []
-    assert_right(tmp_path, path)

@@ -93,6 +93,7 @@ class Supervisor:
         self._beat_s = min(beats, default=None)
         self._ready = self._stopping = self._busy = self._failed = False
         self._status = "starting"
+        self._unsaid: list[str] = []
         self._said_ns = 0
 
     @classmethod
@@ -116,7 +117,7 @@ class Supervisor:
             signal.signal(signal.SIGALRM, lambda *_: self._beat())
             signal.setitimer(signal.ITIMER_REAL, self._beat_s, self._beat_s)
         if self.there:
-            self._tell("STATUS=starting")
+            self._say("starting")
         return self
 
     def __exit__(
@@ -161,34 +162,43 @@ class Supervisor:
 
     def _say(self, status: str, news: str = "") -> None:
         self._status, self._said_ns = " ".join(status.split()), time.monotonic_ns()
-        self._tell(f"{news}\nSTATUS={self._status}".strip())
+        if news:
+            self._unsaid.append(news)
+        self._tell(f"STATUS={self._status}")
 
     def _beat(self) -> None:
         if not self._busy:  # what this has interrupted is a sign of life itself
             self._tell("WATCHDOG=1")
 
     def _tell(self, words: str) -> None:
-        """Tell systemd, and write the file; once in the log where that fails: it is no reason to end."""
+        """Tell systemd, and write the file; once in the log where one of them fails: it is no reason to end."""
         self._busy = True
-        try:
-            if self._address is not None:
-                with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-                    sender.settimeout(SEND_S)
-                    sender.sendto(words.encode(), self._address)
-            if self._file is not None:
-                self._write(self._file)
-        except OSError as error:
-            if not self._failed:
-                log.warning("cannot tell how this process is doing: %s", error)
-            self._failed = True
-        finally:
-            self._busy = False
+        for tell in (self._send, self._write):
+            try:
+                tell(words)
+            except OSError as error:
+                if not self._failed:
+                    log.warning("cannot tell how this process is doing: %s", error)
+                self._failed = True
+        self._busy = False
 
-    def _write(self, file: Path) -> None:
+    def _send(self, words: str) -> None:
+        """To systemd, with the news that it could not be told before."""
+        if self._address is None:
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+            sender.settimeout(SEND_S)
+            sender.sendto("\n".join((*self._unsaid, words)).encode(), self._address)
+        self._unsaid.clear()
+
+    def _write(self, _words: str) -> None:
+        """To the file, whole."""
+        if self._file is None:
+            return
         health = Health(self._ready, self._status, os.getpid(), time.monotonic_ns())
-        whole = file.with_name(f".{file.name}.{os.getpid()}")
+        whole = self._file.with_name(f".{self._file.name}.{os.getpid()}")
         whole.write_text(json.dumps(asdict(health)))
-        whole.replace(file)
+        whole.replace(self._file)
 
 
 def verdict(health: Health, *, alive: bool, within_s: float) -> tuple[bool, dict[str, Any]]:

@@ -146,6 +146,8 @@ class Launcher:
         self._clock = Clock()
         self._clock.keep()
         self._standstill = Standstill()
+        self._dismissed: set[str] = set()
+        """Nodes that came too late."""
         self._begun = False
         """Whether the swarm was seen to run."""
         self._file = options.logs / "scenario.toml"
@@ -317,12 +319,12 @@ class Launcher:
                 return
 
     def _dismiss_latecomers(self) -> None:
-        """Stop nodes that were started again and find nobody to join any more: all others have ended."""
-        running = [child for child in self._nodes.values() if child.running]
-        if all(child.restarts and child.status.get("phase") != "running" for child in running):
-            for child in running:
-                if child.line is not None:
-                    child.line.stop()
+        for child in latecomers(self._nodes.values()):
+            if not child.restarts and child.name not in self._dismissed:
+                self._dismissed.add(child.name)
+                self._failures.append(f"{child.name} had not begun when all others had ended")
+            if child.line is not None:
+                child.line.stop()
 
     def _give_up_stopped(self) -> None:
         """End processes that somebody has stopped, where the run can only wait for them, and has for too long."""
@@ -506,6 +508,17 @@ class Launcher:
                 self._note_cut_short(child)
                 self._selector.unregister(child.line.socket)
                 child.line.close()
+
+
+def latecomers(nodes: Collection[Child]) -> list[Child]:
+    """Nodes that find nobody to join any more: all others have taken their steps and ended.
+
+    They were started again; or the machine was so busy that the others were through before these had begun.
+    """
+    running = [child for child in nodes if child.running]
+    again = all(child.restarts and child.status.get("phase") != "running" for child in running)
+    ended = len(running) < len(nodes) and all(child.status.get("phase") == "joining" for child in running)
+    return running if again or ended else []
 
 
 def free_endpoints(number: int) -> list[str]:
