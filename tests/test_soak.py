@@ -32,6 +32,8 @@ from zfusion.studies.soak.samples import Course, read_samples
 from zfusion.studies.soak.trend import MOST_POINTS, theil_sen
 from zfusion.swarm.watch import NODE
 
+OF_MEMORY = ("anonymous_bytes", "uss_bytes", "pss_bytes", "rss_bytes")
+
 LEAK = """
 kept = []
 
@@ -93,7 +95,7 @@ def test_growth_is_what_is_surely_more_than_is_tolerated() -> None:
     def course(mib_per_hour: float) -> Course:
         t_s = np.arange(0.0, 3600.0, 10.0)
         nothing = np.zeros(len(t_s))
-        columns = dict.fromkeys(COLUMNS, nothing) | {"uss_bytes": (40 + mib_per_hour * t_s / 3600) * 2**20}
+        columns = dict.fromkeys(COLUMNS, nothing) | {"anonymous_bytes": (40 + mib_per_hour * t_s / 3600) * 2**20}
         return Course(NODE, "1", t_s, columns)
 
     COLUMNS = (
@@ -141,7 +143,7 @@ def test_a_short_soak_leaves_samples_report_and_verdict(tmp_path: Path) -> None:
     steps = [int(row["step"]) for row in of_node]
     assert steps == sorted(steps)
     assert int(of_node[-1]["received"]) == 2 * int(of_node[-1]["completed"])  # two stages, one neighbour
-    assert all(2**20 < float(row[name]) < 2**30 for row in rows for name in ("uss_bytes", "pss_bytes", "rss_bytes"))
+    assert all(2**20 < float(row[name]) < 2**30 for row in rows for name in OF_MEMORY)
     assert any(0 < float(row["round_p50_us"]) <= float(row["round_p99_us"]) for row in of_node if row["round_p50_us"])
     page = (directory / "report.html").read_text()
     assert "steady" in page

@@ -102,7 +102,7 @@ def _pictures(
 ) -> Iterator[tuple[str, str, str, Sequence[figure.Panel]]]:
     band = "Of the nodes the median, and the range from the least to the most."
     memory = [_panel(f"{name} [MiB]", courses, f"{column}_bytes", 1 / MIB) for name, column in _MEMORY]
-    yield "memory", "Memory", f"{band} USS is what a process has for itself, RSS all that is resident.", memory
+    yield "memory", "Memory", f"{band} Above, what no file backs; RSS is all that is resident.", memory
     handles = [_panel("descriptors", courses, "fds"), _panel("threads", courses, "threads")]
     yield "handles", "Descriptors and threads", band, handles
     yield "cpu", "Processor", band, [_rates_of_processes("CPU [%]", courses, "cpu_s", 100.0)]
@@ -121,7 +121,7 @@ def _pictures(
     yield "disk", "Written", "Recording and logs.", [figure.Panel(unit, [line]) for unit, line in disk if line]
 
 
-_MEMORY = (("USS", "uss"), ("RSS", "rss"))
+_MEMORY = (("memory", "anonymous"), ("RSS", "rss"))
 
 _DISK = (("recording_bytes", "recording", "MiB", 1 / MIB), ("logs_bytes", LOGS.name, "KiB", 1 / 1024))
 

@@ -27,9 +27,10 @@ from zfusion.swarm.launch import Child
 NODE, RECORDER, LAUNCHER = "node", "recorder", "launcher"
 """Kinds of processes."""
 
-OF_ALL = ("uss_bytes", "pss_bytes", "rss_bytes", "fds", "threads", "cpu_s")
-"""What the machine says of a process: memory that it would give back if it ended (USS), the same and its part of what
-it shares (PSS), all that is resident (RSS); descriptors, threads, CPU time since it began."""
+OF_ALL = ("anonymous_bytes", "uss_bytes", "pss_bytes", "rss_bytes", "fds", "threads", "cpu_s")
+"""What the machine says of a process: memory that no file backs (USS, where that is not known); memory that it would
+give back if it ended (USS); the same and its part of what it shares (PSS); all that is resident (RSS); descriptors,
+threads, CPU time since it began."""
 
 OF_RECORDER = ("messages", "foreign")
 
@@ -144,6 +145,7 @@ class Watch:
                     return {}  # it has just ended
                 return {
                     "pid": pid,
+                    "anonymous_bytes": _anonymous(pid, memory.uss),
                     "uss_bytes": memory.uss,
                     "pss_bytes": getattr(memory, "pss", ""),
                     "rss_bytes": memory.rss,
@@ -174,6 +176,15 @@ class Watch:
         for stage in self._stages:
             row |= _quantiles(stage, told["waits"].get(stage, {}), before.get("waits", {}).get(stage, {}))
         return row
+
+
+def _anonymous(pid: int, otherwise: int) -> int:
+    """Bytes that no file backs. (A library's pages count as a process's own when the last other that has it ends.)"""
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("RssAnon:"):
+                return int(line.split()[1]) * 1024
+    return otherwise
 
 
 def _quantiles(name: str, told: Mapping[str, int], before: Mapping[str, int]) -> dict[str, float]:

@@ -46,7 +46,7 @@ class Quantity:
     meaning: str
 
 
-MEMORY = Quantity("memory", "MiB", 4.0, 4.0, 0.0, "that the process has for itself (USS)")
+MEMORY = Quantity("memory", "MiB", 4.0, 4.0, 0.0, "of the process that no file backs")
 DESCRIPTORS = Quantity("descriptors", "", 1.0, 2.0, 0.0, "open files and sockets")
 THREADS = Quantity("threads", "", 1.0, 2.0, 0.0, "of the process")
 CPU = Quantity("cpu", "%", 5.0, 3.0, LOAD_S, "of one processor")
@@ -138,7 +138,7 @@ def all_series(courses: Sequence[Course], period_s: float | None) -> Iterator[Se
     for course in lives:
         columns = course.columns
         of_process = {
-            MEMORY: columns["uss_bytes"] / 2**20,
+            MEMORY: columns["anonymous_bytes"] / 2**20,
             DESCRIPTORS: columns["fds"],
             THREADS: columns["threads"],
             CPU: 100 * course.rate("cpu_s"),
