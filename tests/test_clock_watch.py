@@ -269,7 +269,7 @@ def test_by_option_they_begin_all_the_same_and_it_is_counted(tmp_path: Path) -> 
     file, run = three(tmp_path, nodes=2, on_clock_offset="warn"), run_name("warned")
     boxes = [Box(tmp_path, "a"), Box(tmp_path, "b", 3 * SECOND // 10)]
     nodes = [
-        Command(tmp_path, "node", file, "--run", run, "--id", n, "--steps", 40, "--json", program=box.zfusion)
+        Command(tmp_path, "node", file, "--run", run, "--id", n, "--steps", 120, "--json", program=box.zfusion)
         for n, box in enumerate(boxes, 1)
     ]
     with ended(nodes):

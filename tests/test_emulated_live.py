@@ -182,7 +182,7 @@ FAULTS = [
 def faulty(directory: Path) -> Result:
     """The example, of which much goes wrong by plan."""
     scenario = variant(directory, "faults", faults=FAULTS, timing={"rate_hz": 20.0})
-    return launch(directory, scenario, "--steps", 100, "--record", "faults.mcap", run=run_name("faults"))
+    return launch(directory, scenario, "--steps", 160, "--record", "faults.mcap", run=run_name("faults"))
 
 
 def test_planned_deaths_are_no_failures(faulty: Result) -> None:

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 
 from reports import Page, experiment, rmse_of
 from simulations import EXAMPLE
-from zfusion.cli import app, report
+from zfusion.cli import app
+from zfusion.cli.common import steps_range
 from zfusion.errors import InputError
 from zfusion.report import extras
 from zfusion.report.experiment_figures import (
@@ -306,7 +307,7 @@ def test_steps_are_for_recordings(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "5:3", "0:3", "a", "1:2:3", "-1:3", "1.5"])
 def test_steps_that_are_none(text: str) -> None:
     with pytest.raises(InputError, match="--steps"):
-        report._range(text)
+        steps_range(text)
 
 
 def test_the_examples_of_the_documentation_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

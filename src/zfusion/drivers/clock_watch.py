@@ -53,7 +53,9 @@ class ClockWatch:
         """Readings of a neighbour's clock, since this node began, that were beyond the limit."""
         self.limit_ns = clock_limit_ns(scenario)
         self._own, self._clock = own, clock
-        self._refuses = scenario.timing.on_clock_offset == "refuse"
+        planned = any(fault.kind == "clock" for fault in scenario.faults)
+        self._refuses = scenario.timing.on_clock_offset == "refuse" and not planned
+        """A scenario that sets a clock wrong wants to see what that does."""
         self._warned: set[NodeId] = set()
 
     def read(self, status: Status, on_machine: str | None, asked_ns: int, answered_ns: int, *, begun: bool) -> None:
