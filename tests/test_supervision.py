@@ -146,6 +146,7 @@ def test_a_node_that_is_stopped_in_its_tracks_does_not_outlive_the_launcher(tmp_
 def test_a_node_that_dies_is_told_and_the_others_go_on(tmp_path: Path) -> None:
     with swarm(tmp_path, "--steps", ENDLESS, **PACED) as running:
         running.wait_for_use(1, [1, 2, 3])  # whom node 1 hears
+        running.wait_for(2, running.step(2) + 50)  # for it to have said how it is doing
         running.kill("--id", "2")
         wait_until(lambda: "node 2 died" in running.command.said(), "the death is told")  # at once, not at the end
         taken = {node: running.taken(node) for node in (1, 3, 4)}

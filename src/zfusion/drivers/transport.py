@@ -23,11 +23,13 @@ from typing import Any, cast
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
-    "(rx: (handover: app), acc: (handover: app), tx: (handover: app), net: (handover: app), "
+    "(rx: (handover: app), acc: (handover: app), net: (handover: app), tx: (worker_threads: 1), "
     "app: (worker_threads: 1, max_blocking_threads: 50))",
 )
-# One thread for all of Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on. Beside
-# it there are those that wait for something, of which it makes more and more where links come and go under load.
+# Two threads for Zenoh's tasks: a node has a few small messages at a time, and threads only pass them on. Sending has
+# one of its own: the other may have to wait for a place in the queue of a link, as when it ends a query that this node
+# has answered, and would wait for itself if it had to make that place. Beside them there are those that wait for
+# something, of which Zenoh makes more and more where links come and go under load.
 
 import zenoh
 
