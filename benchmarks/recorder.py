@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from results import tell
 from zfusion import keys
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.transport import open_session, publisher
@@ -106,11 +107,7 @@ def main() -> None:
         "ratio": round(cpu / floor, 1),
         "bytes_per_message": round(recorded[0]["bytes_per_message"], 1),
     }
-    if options.json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:32} {value}")
+    tell(result, options.json)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,13 @@ damaged block.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from results import tell
 from zfusion.drivers.simulated import simulate
 from zfusion.model.scenario import load_scenario
 from zfusion.recording import Recording
@@ -59,11 +59,7 @@ def main() -> None:
     each = {name: statistics.median(of) / messages * 1e6 for name, of in times.items()}
     result = {"messages": messages, **{f"{name}_us_per_message": round(us, 2) for name, us in each.items()}}
     result |= {"bytes": len(data), "recover_over_read": round(each["recover"] / each["read"], 1)}
-    if options.json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:32} {value}")
+    tell(result, options.json)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,12 @@ Both on the same simulated recording of the four-sensor example, in turn, in one
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
 
+from results import tell
 from zfusion.drivers.replayed import verify
 from zfusion.drivers.simulated import simulate
 from zfusion.messages import decode_any
@@ -55,11 +55,7 @@ def main() -> None:
     result = {"messages": messages, **{f"{name}_us_per_message": round(us, 2) for name, us in each.items()}}
     result |= {"verify_over_read": round(each["verify"] / each["read"], 1)}
     result |= {"verify_steps_per_s": round(options.steps / statistics.median(verified))}
-    if options.json:
-        print(json.dumps(result))
-    else:
-        for name, value in result.items():
-            print(f"{name:32} {value}")
+    tell(result, options.json)
 
 
 if __name__ == "__main__":

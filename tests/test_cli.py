@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+from click import Command
+from typer.core import TyperOption
+from typer.main import get_command
 
 from oracles.paper import ERROR_VARIANCES
-from zfusion.cli import run
+from zfusion import __version__
+from zfusion.cli import app, run
 from zfusion.cli.common import unused
 
 ROOT = Path(__file__).parents[1]
@@ -233,6 +237,24 @@ def test_bad_usage_is_exit_code_2(tmp_path: Path, refused: Refused, arguments: t
 def test_what_is_refused_is_exit_code_2_of_the_process_too(tmp_path: Path) -> None:
     assert "nothing.toml" in zfusion("launch", "nothing.toml", cwd=tmp_path, code=2).stderr
     assert "frobnicate" in zfusion("frobnicate", cwd=tmp_path, code=2).stderr
+
+
+def test_version_is_told(tmp_path: Path) -> None:
+    assert zfusion("--version", cwd=tmp_path).stdout == f"zfusion {__version__}\n"
+
+
+def test_no_help_text_is_taken_for_markup() -> None:
+    """What stands in brackets is a style to the help's renderer, and is gone from what it prints."""
+
+    def texts(command: Command) -> Iterator[str]:
+        yield command.help or ""
+        yield from (parameter.help or "" for parameter in command.params if isinstance(parameter, TyperOption))
+        for name in getattr(command, "commands", {}):
+            yield from texts(command.commands[name])  # type: ignore[attr-defined]
+
+    found = list(texts(get_command(app)))
+    assert len(found) > 200
+    assert [text for text in found if "[" in text] == []
 
 
 def test_a_truncated_recording_is_verified_as_far_as_it_goes(simulated: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -151,6 +152,12 @@ ALTERNATED = {
     ("slack", MISSING): (0.5398, 0.5320),
     ("paper", SURE): (0.4065, 0.4025),
     ("paper", MISSING): (0.5456, 0.5371),
+    ("paper, in other units", SURE): (0.4065, 0.4025),
+}
+STARTS: dict[str, Callable[[tuple[float, ...]], Gains]] = {
+    "slack": lambda arrival: slack_filters(arrival, -0.1).gains,
+    "paper": lambda arrival: diagonal_design(switching(arrival)).gains,
+    "paper, in other units": lambda arrival: filters(arrival, "general").gains,
 }
 
 
@@ -160,19 +167,19 @@ ALTERNATED = {
 def test_alternation_that_has_converged_is_where_the_reference_is_or_better(
     start: str, arrival: tuple[float, ...]
 ) -> None:
-    """With misses the reference was ended after a round or two: those that follow prove a γ smaller by up to 0.2 %."""
+    """A smaller γ with a proof is a better one; the reference was ended earlier where there are misses.
+
+    The problem is not convex, and where an alternation leads is a matter of rounding: without misses, from the paper's
+    design in two units of the noises, whose gains differ by 1e-8, it ends at 0.4062 and at 0.4068, the reference
+    between them.
+    """
     gamma, worst = ALTERNATED[start, arrival]
     problem = switching(arrival)
-    begun = slack_filters(arrival, -0.1).gains if start == "slack" else filters(arrival, "general").gains
-    found = alternate(problem, begun)
+    found = alternate(problem, STARTS[start](arrival))
     reached = worst_disturbance(problem, found.gains).gain
-    assert (
-        reached <= found.certificate.gamma <= 1.003 * gamma
-    )  # from the paper's design it creeps, and ends 0.25 % above
-    if arrival is SURE:
-        assert (found.certificate.gamma, reached) == pytest.approx((gamma, worst), rel=3e-3)
-    else:
-        assert 0.998 * gamma < found.certificate.gamma
+    beyond = 3 * DIGITS if start != "slack" and arrival is SURE else DIGITS
+    assert 0.997 * gamma < found.certificate.gamma <= gamma + beyond
+    assert reached <= min(found.certificate.gamma, worst + 3 * DIGITS)
     again = certify(problem, found.gains)  # which proves its numbers by eigenvalues
     assert again.gamma == pytest.approx(found.certificate.gamma, rel=1e-5)
 

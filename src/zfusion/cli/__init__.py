@@ -80,15 +80,20 @@ def run() -> None:
         sys.exit(error.exit_code)
 
 
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"zfusion {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def _options(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell more.")] = False,
     log_format: Annotated[
         logs.LogFormat, typer.Option(envvar=logs.VARIABLE, help="How logs are written.", show_envvar=True)
     ] = logs.LogFormat.TEXT,
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.", is_eager=True)] = False,
+    version: Annotated[  # noqa: ARG001 - its callback has told it by now
+        bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_tell_version)
+    ] = False,
 ) -> None:
-    if version:
-        out.print(f"zfusion {__version__}")
-        raise typer.Exit
     logs.configure(log_format, err, verbose=verbose)

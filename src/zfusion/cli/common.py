@@ -38,7 +38,7 @@ MethodName = Annotated[
 ]
 Links = Annotated[
     Path | None,
-    typer.Option("--links", help="File of [links] and [[faults]] (TOML).", show_default="the scenario's"),
+    typer.Option("--links", help="File of links and faults (TOML).", show_default="the scenario's"),
 ]
 Loss = Annotated[
     float | None,

@@ -63,7 +63,7 @@ def replay(
     links: Annotated[
         str | None,
         typer.Option(
-            help="File of [links] and [[faults]], or 'recorded': the latencies that were measured.",
+            help="File of links and faults, or 'recorded': the latencies that were measured.",
             show_default="the scenario's",
         ),
     ] = None,

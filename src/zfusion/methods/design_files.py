@@ -7,10 +7,11 @@ design of, and is one of nothing else.
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 from zipfile import BadZipFile
 
 import numpy as np
@@ -41,6 +42,28 @@ class Content(NamedTuple):
 
 class DesignFileError(InputError):
     """A design file that cannot be used: missing, damaged, of another version, method or system."""
+
+
+class Stored(ABC):
+    """A design that can be kept in a file."""
+
+    @abstractmethod
+    def packed(self) -> bytes:
+        """What its file holds."""
+
+    @classmethod
+    @abstractmethod
+    def unpack(cls, content: Content, made_for: str | None = None) -> Self:
+        """As `load`, of what is in a file."""
+
+    def save(self, path: Path) -> None:
+        """Write it as an .npz archive; InputError where that cannot be done."""
+        write(path, self.packed())
+
+    @classmethod
+    def load(cls, path: Path, made_for: str | None = None) -> Self:
+        """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
+        return cls.unpack(read(path), made_for)
 
 
 def fingerprint(parts: Iterable[tuple[str, object]]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +29,7 @@ OPTIONAL = ("tau", "lower_bound")
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
+class Design(design_files.Stored):
     """The gains of all nodes by mode, and what is known of them."""
 
     ids: tuple[NodeId, ...]
@@ -88,12 +87,8 @@ class Design:
         at = slice(i * nx, (i + 1) * nx)
         return self.gains.K[mode, at, j * nx : (j + 1) * nx], self.gains.H[mode, at, self.problem.rows(j)]
 
-    def save(self, path: Path) -> None:
-        """Write it as an .npz archive; InputError where that cannot be done."""
-        design_files.write(path, self.packed())
-
     def packed(self) -> bytes:
-        """What such an archive holds."""
+        """See `Stored`."""
         problem = self.problem
         arrays: dict[str, Any] = {"ids": design_files.stored_ids(self.ids), **self.gains._asdict(), "ny": problem.ny}
         arrays |= {
@@ -105,13 +100,8 @@ class Design:
         return design_files.packed(METHOD, self.fingerprint, arrays)
 
     @classmethod
-    def load(cls, path: Path, made_for: str | None = None) -> Self:
-        """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
-        return cls.unpack(design_files.read(path), made_for)
-
-    @classmethod
     def unpack(cls, content: design_files.Content, made_for: str | None = None) -> Self:
-        """As `load`, of what is in a file."""
+        """See `Stored`."""
         arrays: dict[str, Any] = design_files.unpack(content, METHOD, made_for)
         ends = np.cumsum(arrays["ny"]).tolist()
         rows = [slice(end - size, end) for end, size in zip(ends, arrays["ny"].tolist(), strict=True)]

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zfusion.methods.convex import Solved, block_variable, cvxpy, positive, solve
-from zfusion.methods.l2_linf.problem import Gains, Mask, Problem, normalised
+from zfusion.methods.l2_linf.problem import Gains, Problem, normalised
+from zfusion.methods.plant import Mask
 from zfusion.model.types import Array
 
 FAILURE = "no filter with P=diag(R,Q(s)) found"

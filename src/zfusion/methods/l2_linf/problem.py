@@ -15,14 +15,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zfusion.methods.convex import DesignError
 from zfusion.methods.gramians import lyapunov, spectral_radius
+from zfusion.methods.plant import Mask, Sensed
 from zfusion.model.checks import ModelError, finite_array
 from zfusion.model.types import Array
-
-Mask = NDArray[np.bool_]
 
 PROBABILITY_SUM = 1e-9
 """How far from 1 a row of transition probabilities may add up, for decimals typed by hand."""
@@ -38,7 +36,7 @@ class Gains(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Sensed):
     """Plant, sensors, modes. Refuses what no filters can be designed for (ModelError, DesignError)."""
 
     A: Array
@@ -80,16 +78,6 @@ class Problem:
             object.__setattr__(self, name, value)
 
     @property
-    def n(self) -> int:
-        """Number of nodes."""
-        return len(self.C)
-
-    @property
-    def nx(self) -> int:
-        """Size of the state."""
-        return len(self.A)
-
-    @property
     def nw(self) -> int:
         """Size of the disturbance."""
         return int(self.B.shape[1])
@@ -98,11 +86,6 @@ class Problem:
     def size(self) -> int:
         """N = n nx, of all estimates together."""
         return self.n * self.nx
-
-    @property
-    def ny(self) -> tuple[int, ...]:
-        """p_i, the sizes of the measurements."""
-        return tuple(len(c) for c in self.C)
 
     @cached_property
     def masks(self) -> tuple[Mask, ...]:

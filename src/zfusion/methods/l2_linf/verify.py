@@ -45,23 +45,36 @@ def certify(problem: Problem, gains: Gains) -> Certificate:
 
     Usually some per cent below what a design with less freedom says.
     """
-    cp = cvxpy()
     problem, unit = normalised(problem)
     motions = closed(problem, gains)
     if not (size := radius(problem, gains)) < 1:
         raise DesignError(f"{FAILURE}: they are not stable in mean square (radius {size:.6g})")
+    Ps, delta = unknown_proof(problem)
+    solve(delta, proves(problem, motions, Ps, delta), FAILURE)
+    _check(problem, motions, np.array([P.value for P in Ps]), float(delta.value))
+    return Certificate(unit * float(np.sqrt(delta.value)), tuple(P.value / unit**2 for P in Ps))
+
+
+def unknown_proof(problem: Problem) -> tuple[list[Any], Any]:
+    """P(s) of each mode, (nx + N, nx + N), and δ = γ², to be solved for."""
+    cp = cvxpy()
     extended = problem.nx + problem.size
-    Ps = [cp.Variable((extended, extended), symmetric=True) for _ in problem.masks]
-    delta = cp.Variable()
+    return [cp.Variable((extended, extended), symmetric=True) for _ in problem.masks], cp.Variable()
+
+
+def proves(problem: Problem, motions: list[Closed], Ps: list[Any], delta: Any, margin: Any = 0.0) -> list[Any]:
+    """The constraints under which the P(s) prove γ² = δ of given filters, the first of them with a margin.
+
+    diag(P, I) - [A B]ᵀ P̄ [A B] - Σ_i [A_i 0]ᵀ P̄ [A_i 0] >= margin I,   [P, L_zᵀ; L_z, δ I] >= 0,   P̄ = Σ_t π_st P(t)
+    """
+    cp = cvxpy()
     constraints = []
     for s, motion in enumerate(motions):
         mean = sum(chance * P for chance, P in zip(problem.transition[s], Ps, strict=True) if chance > 0)
-        constraints.append(positive_matrix(cp.bmat(_dissipated(Ps[s], mean, motion))))
-        peak = delta * np.eye(len(problem.output))
-        constraints.append(positive([[Ps[s], None], [problem.output, peak]]))
-    solve(delta, constraints, FAILURE)
-    _check(problem, motions, np.array([P.value for P in Ps]), float(delta.value))
-    return Certificate(unit * float(np.sqrt(delta.value)), tuple(P.value / unit**2 for P in Ps))
+        left = cp.bmat(_dissipated(Ps[s], mean, motion))
+        constraints.append(positive_matrix(left - margin * np.eye(left.shape[0])))
+        constraints.append(positive([[Ps[s], None], [problem.output, delta * np.eye(len(problem.output))]]))
+    return constraints
 
 
 def _dissipated(P: Any, mean: Any, motion: Closed) -> list[list[Any]]:

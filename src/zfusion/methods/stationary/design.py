@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -45,7 +44,7 @@ ROBUST = (
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
+class Design(design_files.Stored):
     """The gains of all nodes, what was promised, and what they really do.
 
     What no convex design was made for has no bound; what is no descent has no iterations.
@@ -110,12 +109,8 @@ class Design:
         """Of the problem that it solves: the system, the graph and the weights."""
         return fingerprint(self.ids, self.problem)
 
-    def save(self, path: Path) -> None:
-        """Write it as an .npz archive; InputError where that cannot be done."""
-        design_files.write(path, self.packed())
-
     def packed(self) -> bytes:
-        """What such an archive holds."""
+        """See `Stored`."""
         arrays: dict[str, Any] = {
             "ids": design_files.stored_ids(self.ids),
             **self.gains._asdict(),
@@ -129,13 +124,8 @@ class Design:
         return design_files.packed(METHOD, self.fingerprint, arrays)
 
     @classmethod
-    def load(cls, path: Path, made_for: str | None = None) -> Self:
-        """Read one; DesignFileError unless it is of this method, and for the fingerprint `made_for` where given."""
-        return cls.unpack(design_files.read(path), made_for)
-
-    @classmethod
     def unpack(cls, content: design_files.Content, made_for: str | None = None) -> Self:
-        """As `load`, of what is in a file."""
+        """See `Stored`."""
         arrays: dict[str, Any] = design_files.unpack(content, METHOD, made_for)
         gains = Gains(arrays["F"], arrays["G"], arrays["H"])
         told = {name: arrays[name].tolist() if arrays[name].ndim == 0 else arrays[name] for name in SCALARS}

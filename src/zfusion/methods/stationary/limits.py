@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from zfusion.methods.gramians import predictor_covariance, predictor_gain, riccati_step
+from zfusion.methods.plant import Mask
 from zfusion.methods.stationary.cost import Gains
-from zfusion.methods.stationary.problem import Mask, Plant, Problem
+from zfusion.methods.stationary.problem import Plant, Problem
 from zfusion.model.types import Array
 
 

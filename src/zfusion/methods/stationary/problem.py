@@ -13,18 +13,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zfusion.methods.convex import DesignError
 from zfusion.methods.gramians import spectral_radius
+from zfusion.methods.plant import Mask, Sensed
 from zfusion.model.checks import ModelError, covariance_matrix, finite_array, semidefinite_factor
 from zfusion.model.types import Array
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class Plant(Sensed):
     """One plant with its sensors, all matrices constant. ModelError unless they fit one another."""
 
     A: Array
@@ -52,21 +51,6 @@ class Plant:
         fields = {"A": finite_array("A", A, (nx, nx)), "B": B, "C": C, "D": D}
         for name, value in (fields | {"W": covariance_matrix("W", self.W, B.shape[1]), "V": V}).items():
             object.__setattr__(self, name, value)
-
-    @property
-    def n(self) -> int:
-        """Number of nodes."""
-        return len(self.C)
-
-    @property
-    def nx(self) -> int:
-        """Size of the state."""
-        return len(self.A)
-
-    @property
-    def ny(self) -> tuple[int, ...]:
-        """p_i, the sizes of the measurements."""
-        return tuple(len(c) for c in self.C)
 
     @cached_property
     def stacked_C(self) -> Array:
