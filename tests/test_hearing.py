@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from simulations import walk
 from zfusion.drivers.account import make_node
 from zfusion.drivers.hearing import FAR, EmulatedHearing, Heard
+from zfusion.drivers.inbox import Posted
 from zfusion.links import Edge, Timeline
 from zfusion.messages import Decoder, encode
 from zfusion.methods import METHODS
@@ -37,7 +37,7 @@ class Inbox:
     """What has come."""
 
     def __init__(self) -> None:
-        self.posted: deque[Any] = deque()
+        self.posted = Posted()
         self.overrun = 0
         self.rests: list[int] = []
 
@@ -91,7 +91,7 @@ class Driver:
     def post(self, sender: int, sent_ns: int, *, received_ns: int | None = None, seq: int = 0, step: int = 1) -> None:
         message = Message(sender, step, MEASUREMENT.name, seq, 1, sent_ns, {"y": self.y[sender]})
         data = encode(message)
-        self.inbox.posted.append(((sender, MEASUREMENT.name), data, received_ns or sent_ns))
+        self.inbox.posted.add((sender, MEASUREMENT.name), data, received_ns or sent_ns)
 
     def look(self, at_ns: int) -> None:
         self.time.ns = at_ns
@@ -195,7 +195,7 @@ def test_in_the_end_all_is_heard_that_has_come(driver: Driver) -> None:
 
 def test_what_is_no_message_is_counted(driver: Driver) -> None:
     sender = driver.senders[0]
-    driver.inbox.posted.append(((sender, MEASUREMENT.name), b"nonsense", driver.start))
+    driver.inbox.posted.add((sender, MEASUREMENT.name), b"nonsense", driver.start)
     driver.look(driver.start + MS)
     assert driver.node is not None
     assert sum(driver.node.counters[sender].refused.values()) == 1

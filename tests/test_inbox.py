@@ -13,7 +13,7 @@ import zenoh
 from swarms import wait_until
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.inbox import POSTED, STRETCH_NS, Inbox, Letter, Wake
+from zfusion.drivers.inbox import POSTED, POSTED_BYTES, STRETCH_NS, Inbox, Letter, Posted, Wake
 from zfusion.drivers.transport import RECEIPT, open_session
 from zfusion.swarm.launch import free_endpoints
 
@@ -274,11 +274,11 @@ def test_what_is_posted_comes_in_order_with_its_time_and_ends_a_rest_that_minds_
     pair.put("a", b"three")
     wait_until(lambda: len(pair.inbox.posted) == 3, "three messages")
     assert not pair.inbox.rest(before + SOON_NS, or_posted=True)
-    assert [(source, data) for source, data, _ in pair.inbox.posted] == [("a", b"one"), ("b", b"two"), ("a", b"three")]
-    times = [at for *_, at in pair.inbox.posted]
+    letters = [letter for _ in range(4) if (letter := pair.inbox.posted.take())]
+    assert [(source, data) for source, data, _ in letters] == [("a", b"one"), ("b", b"two"), ("a", b"three")]
+    times = [at for *_, at in letters]
     assert before <= times[0] <= times[1] <= times[2] <= pair.clock.now()
     assert pair.inbox.rest(time.time_ns() + 1_000_000)  # who does not mind what is posted sleeps on
-    pair.inbox.posted.clear()
     threading.Timer(0.05, pair.put, ("b", b"four")).start()
     assert not pair.inbox.rest(before + SOON_NS, or_posted=True)
 
@@ -286,9 +286,24 @@ def test_what_is_posted_comes_in_order_with_its_time_and_ends_a_rest_that_minds_
 def test_what_is_posted_does_not_fill_the_memory(pair: Pair) -> None:
     pair.inbox.subscribe_posted("a", "test/a")
     pair.subscribe()
-    pair.inbox.posted.extend([("a", b"", 0)] * (POSTED - 1))
+    for _ in range(POSTED - 1):
+        pair.inbox.posted.add("a", b"", 0)
     pair.put("a", b"fits")
     pair.put("a", b"does not")
     wait_until(lambda: pair.inbox.overrun, "a message too many")
     assert (len(pair.inbox.posted), pair.inbox.overrun) == (POSTED, 1)
-    assert pair.inbox.posted[-1][1] == b"fits"
+    letters = [pair.inbox.posted.take() for _ in range(POSTED)]
+    assert letters[-1] is not None
+    assert letters[-1][1] == b"fits"
+    assert pair.inbox.posted.take() is None
+
+
+def test_few_large_messages_that_are_posted_do_not_fill_the_memory() -> None:
+    posted, large = Posted(), bytes(POSTED_BYTES // 4)
+    taken = [posted.add("a", large, n) for n in range(5)]
+    assert taken == [True] * 4 + [False]
+    assert posted.add("a", b"", 5)
+    assert posted.take() == ("a", large, 0)
+    assert posted.add("a", large, 6)
+    assert not posted.add("a", b"1", 7)
+    assert len(posted) == 5

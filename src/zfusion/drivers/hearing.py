@@ -204,8 +204,8 @@ class EmulatedHearing(Hearing):
     def _sort_in(self) -> None:
         """Find out what becomes of all that has come."""
         posted = self._inbox.posted
-        while posted:
-            channel, data, received = posted.popleft()
+        while (letter := posted.take()) is not None:
+            channel, data, received = letter
             node, message = self._listener.node, self._decoded(channel, data)
             if node is None or message is None:
                 continue

@@ -37,6 +37,10 @@ of a swarm in step, far shorter than deadlines of seconds."""
 POSTED = 65_536
 """Messages that wait where they do not wait in channels; beyond it they are dropped, and counted."""
 
+POSTED_BYTES = 256 << 20
+"""And what all of them together may have: no sender is to fill the memory with few large ones. Seconds of a swarm whose
+messages are as large as they may be."""
+
 NEVER = 2**63
 """Later than every time on the clock, in nanoseconds."""
 
@@ -61,6 +65,36 @@ class Wake:
         self._lock.acquire(timeout=min(seconds, threading.TIMEOUT_MAX))
 
 
+class Posted:
+    """Messages from Zenoh's thread to its owner's, in the order of coming: bounded in number and in bytes."""
+
+    def __init__(self) -> None:
+        self._letters: deque[tuple[Any, bytes, int]] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._letters)
+
+    def add(self, source: Any, data: bytes, time_ns: int) -> bool:
+        """False where there is no room."""
+        with self._lock:
+            if len(self._letters) >= POSTED or self._bytes + len(data) > POSTED_BYTES:
+                return False
+            self._bytes += len(data)
+            self._letters.append((source, data, time_ns))
+            return True
+
+    def take(self) -> tuple[Any, bytes, int] | None:
+        """(source, payload, time) of the first, if there is one."""
+        if not self._letters:
+            return None
+        with self._lock:
+            letter = self._letters.popleft()
+            self._bytes -= len(letter[1])
+            return letter
+
+
 class _Wait(NamedTuple):
     """One wait of the owner's thread; each is an object of its own."""
 
@@ -75,8 +109,8 @@ class Inbox:
         """All times are `clock`'s; by default the machine's."""
         self.notices: deque[Any] = deque()
         """What happened besides messages, in order; filled by `notify` from any thread."""
-        self.posted: deque[tuple[Any, bytes, int]] = deque()
-        """(source, payload, time) of what came from sources that are not read one by one, in the order of coming."""
+        self.posted = Posted()
+        """What came from sources that are not read one by one."""
         self.overrun = 0
         """What came from them and was dropped, being too much."""
         self._session = session
@@ -107,8 +141,7 @@ class Inbox:
 
         def post(sample: Any) -> None:
             data = sample.payload.to_bytes()
-            if len(self.posted) < POSTED:
-                self.posted.append((str(sample.key_expr) if source is None else source, data, self._now()))
+            if self.posted.add(str(sample.key_expr) if source is None else source, data, self._now()):
                 self._alarm.set()
             else:
                 self.overrun += 1

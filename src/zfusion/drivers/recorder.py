@@ -177,10 +177,10 @@ class Recorder:
 
     def _take(self) -> bool:
         """Write the next message that was posted, if there is one."""
-        if not self._inbox.posted:
+        letter = self._inbox.posted.take()
+        if letter is None:
             return False
-        key, data, at = self._inbox.posted.popleft()
-        self._receive(key, data, at)
+        self._receive(*letter)
         return True
 
     def _receive(self, key: str, payload: Any, now: int) -> None:
