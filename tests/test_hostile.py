@@ -28,6 +28,7 @@ from swarms import (
     wait_until,
     zfusion,
 )
+from zfusion.drivers.inbox import CHANNEL
 from zfusion.recording import Recording
 
 VICTIM = 2
@@ -200,6 +201,32 @@ def test_a_free_running_swarm_makes_the_same_estimates(tmp_path: Path) -> None:
     for place, estimate in estimates(tmp_path / "calm.mcap").items():
         assert ours[place] == estimate
     assert zfusion(tmp_path, "replay", path, "--verify", "--json").summary["different"] == 0
+
+
+@pytest.mark.timeout(400)
+def test_a_flood_while_all_rest_fills_no_memory_and_costs_nobody_a_link(tmp_path: Path) -> None:
+    """Five seconds from step to step: more than twice the lease of links that nothing is read from."""
+    small, large = 3 * CHANNEL, 300
+    with attacked(tmp_path, timing={"rate_hz": 0.2}) as (command, attack, overheard, path):
+        wait_for_step(overheard, 1, 2, command)
+        for n in range(small):
+            attack.put(f"node/{VICTIM}/measurement", b"flood" if n % (small // large) else bytes(HUGE))
+        wait_for_step(overheard, 1, 4, command)
+        most = max(_most_memory(pid) for pid in census(attack.run))
+        command.interrupt()
+        result = command.wait()
+    assert result.code == 0, result.err
+    assert sum(result.summary["refused"].values()) == LISTENERS * small
+    assert (result.summary["missed"], result.summary["lost"], result.summary["failures"]) == (0, 0, [])
+    events = [message.payload["kind"] for message in recorded(path) if message.topic.endswith("/event")]
+    assert "gone" not in events[: events.index("stopped")]
+    assert most < large * HUGE / 3
+
+
+def _most_memory(pid: int) -> int:
+    """Bytes that a process had at the most so far."""
+    status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM"))
 
 
 @pytest.mark.timeout(400)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from reprlib import repr as short
 
 
 class ZfusionError(Exception):
@@ -67,6 +68,15 @@ class RunError(ZfusionError):
 class MessageError(ZfusionError):
     """Bytes from a peer that are not a legal message; `reason` is the counter they are counted under."""
 
-    def __init__(self, reason: str, detail: str = "") -> None:
+    def __init__(self, reason: str, detail: str = "", *values: object) -> None:
+        """`detail` says more of it; {} in it are what `values` look like, cut short, when somebody wants to read it.
+
+        Nobody does where such messages are counted only, and a flood of them is to cost as little as can be.
+        """
         self.reason = reason
-        super().__init__(f"{reason}: {detail}" if detail else reason)
+        self._detail, self._values = detail, values
+        super().__init__(reason)
+
+    def __str__(self) -> str:
+        detail = self._detail.format(*map(short, self._values)) if self._values else self._detail
+        return f"{self.reason}: {detail}" if detail else self.reason

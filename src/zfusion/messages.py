@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from math import isfinite, prod
 from operator import lt
-from reprlib import repr as short
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -165,9 +164,9 @@ class Decoder:
             version, node, step = raw["v"], raw["node"], raw["step"]
             seq, born, t_ns = raw["seq"], raw["born"], raw["t_ns"]
             if type(version) is not int or version != VERSION:
-                raise MessageError(Reason.VERSION, f"{short(version)}, expected {VERSION}")
+                raise MessageError(Reason.VERSION, "{}, expected {}", version, VERSION)
             if type(node) is not self._node_type or node != self._node:
-                raise MessageError(Reason.WRONG_NODE, f"{short(node)} on the key of {self._node!r}")
+                raise MessageError(Reason.WRONG_NODE, "{} on the key of {}", node, self._node)
             _check_counters(step, seq, born, t_ns)
             fields: dict[str, object] = {}
             for name, read in self._readers:
@@ -300,13 +299,13 @@ def _limits(stage: Stage, node: NodeId, sizes: Mapping[str, int], ids: frozenset
 
 def _unpack(data: bytes, most_bytes: int, most_elements: int) -> _Raw:
     if len(data) > most_bytes:
-        raise MessageError(Reason.TOO_LARGE, f"{len(data)} bytes, expected at most {most_bytes}")
+        raise MessageError(Reason.TOO_LARGE, "{} bytes, expected at most {}", len(data), most_bytes)
     try:
         raw = _unpackb(data, max_array_len=most_elements)
     except (ValueError, msgpack.UnpackException) as error:
-        raise MessageError(Reason.NOT_MSGPACK, str(error)) from None
+        raise MessageError(Reason.NOT_MSGPACK, "{}", error) from None
     if type(raw) is not dict:
-        raise MessageError(Reason.NOT_A_MAP, short(raw))
+        raise MessageError(Reason.NOT_A_MAP, "{}", raw)
     return raw
 
 
@@ -314,7 +313,7 @@ def _check_counters(step: Any, seq: Any, born: Any, t_ns: Any) -> None:
     if not type(step) is type(seq) is type(born) is type(t_ns) is int:
         raise MessageError(Reason.WRONG_TYPE, "step, seq, born and t_ns: expected integers")
     if not (1 <= born <= step <= MAX_STEP and 0 <= seq <= MAX_STEP and 0 <= t_ns <= MAX_TIME_NS):
-        raise MessageError(Reason.OUT_OF_RANGE, f"{step=} {seq=} {born=} {t_ns=}")
+        raise MessageError(Reason.OUT_OF_RANGE, "step={} seq={} born={} t_ns={}", step, seq, born, t_ns)
 
 
 def _check_plain(root: object) -> None:
@@ -330,7 +329,7 @@ def _check_plain(root: object) -> None:
             elif type(item) is list:
                 below.extend(item)
             elif type(item) not in _PLAIN:
-                raise MessageError(Reason.WRONG_TYPE, f"{short(item)}: expected what JSON can say")
+                raise MessageError(Reason.WRONG_TYPE, "{}: expected what JSON can say", item)
         if not below:
             return
         level = below
@@ -338,7 +337,7 @@ def _check_plain(root: object) -> None:
 
 
 def _wrong_type(name: str, value: object, expected: str) -> MessageError:
-    return MessageError(Reason.WRONG_TYPE, f"{name}: expected {expected}, is {short(value)}")
+    return MessageError(Reason.WRONG_TYPE, f"{name}: expected {expected}, is {{}}", value)
 
 
 def _vector(name: str, shape: tuple[int, ...], _legal: frozenset[NodeId]) -> _Reader:
@@ -350,12 +349,12 @@ def _vector(name: str, shape: tuple[int, ...], _legal: frozenset[NodeId]) -> _Re
         if type(values) is not list:
             raise _wrong_type(name, values, "a list of floats")
         if len(values) != length:
-            raise MessageError(Reason.WRONG_SHAPE, f"{name}: {len(values)} elements, expected {length}")
+            raise MessageError(Reason.WRONG_SHAPE, name + ": {} elements, expected {}", len(values), length)
         if not _FLOAT.issuperset(map(type, values)):
             raise _wrong_type(name, values, "nothing but floats")
         # A finite sum has finite terms only; an infinite one may come of large terms, and is looked at closely.
         if not isfinite(sum(values)) and not all(map(isfinite, values)):
-            raise MessageError(Reason.NOT_FINITE, f"{name}: {short(values)}")
+            raise MessageError(Reason.NOT_FINITE, name + ": {}", values)
         return np.ndarray(shape, dtype, to_bytes(*values))  # on bytes: read-only
 
     return read
@@ -378,7 +377,7 @@ def _matrix(name: str, shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Rea
         if type(told) is not list or not _INTEGER.issuperset(map(type, told)):
             raise _wrong_type("shape", told, "a list of integers")
         if told != wanted:
-            raise MessageError(Reason.WRONG_SHAPE, f"{name}: {short(told)}, expected {wanted}")
+            raise MessageError(Reason.WRONG_SHAPE, name + ": {}, expected {}", told, wanted)
         return read_entries(values, raw)
 
     return read
@@ -391,9 +390,9 @@ def _ids(name: str, _shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Reade
         if type(ids) is not list or not types.issuperset(map(type, ids)):
             raise _wrong_type(name, ids, "a list of node ids")
         if not legal.issuperset(ids):
-            raise MessageError(Reason.UNKNOWN_ID, f"{name}: {short(ids)}")
+            raise MessageError(Reason.UNKNOWN_ID, name + ": {}", ids)
         if not all(map(lt, ids, ids[1:])):
-            raise MessageError(Reason.NOT_SORTED, f"{name}: {short(ids)}")
+            raise MessageError(Reason.NOT_SORTED, name + ": {}", ids)
         return tuple(ids)
 
     return read
@@ -404,7 +403,7 @@ def _step(name: str, _shape: tuple[int, ...], _legal: frozenset[NodeId]) -> _Rea
         if type(step) is not int:
             raise _wrong_type(name, step, "an integer")
         if not 1 <= step <= MAX_STEP:
-            raise MessageError(Reason.OUT_OF_RANGE, f"{name}: {step}")
+            raise MessageError(Reason.OUT_OF_RANGE, name + ": {}", step)
         return step
 
     return read
@@ -417,7 +416,7 @@ def _history(name: str, shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Re
         if type(runs) is not list:
             raise _wrong_type(name, runs, "a list of runs")
         if len(runs) > MAX_HISTORY_RUNS:
-            raise MessageError(Reason.TOO_LARGE, f"{name}: {len(runs)} runs, expected at most {MAX_HISTORY_RUNS}")
+            raise MessageError(Reason.TOO_LARGE, name + ": {} runs, expected at most {}", len(runs), MAX_HISTORY_RUNS)
         step, previous = raw["step"], raw["born"] - 1
         history = []
         for run in runs:
@@ -425,7 +424,9 @@ def _history(name: str, shape: tuple[int, ...], legal: frozenset[NodeId]) -> _Re
                 raise _wrong_type(name, run, "[first step, node ids]")
             first, ids = run
             if not previous < first < step:
-                raise MessageError(Reason.BAD_HISTORY, f"{name}: a run from {first} after {previous} at step {step}")
+                raise MessageError(
+                    Reason.BAD_HISTORY, name + ": a run from {} after {} at step {}", first, previous, step
+                )
             history.append((first, read_ids(ids, raw)))
             previous = first
         return tuple(history)
@@ -438,7 +439,7 @@ def _text(name: str, _shape: tuple[int, ...], _legal: frozenset[NodeId]) -> _Rea
         if type(text) is not str:
             raise _wrong_type(name, text, "text")
         if len(text) > MAX_TEXT:
-            raise MessageError(Reason.TOO_LARGE, f"{name}: {len(text)} characters, expected at most {MAX_TEXT}")
+            raise MessageError(Reason.TOO_LARGE, name + ": {} characters, expected at most {}", len(text), MAX_TEXT)
         return text
 
     return read

@@ -9,6 +9,7 @@ Both decode what comes and give it to the node's driver; what is no message of t
 
 from __future__ import annotations
 
+from functools import partial
 from heapq import heappop, heappush
 from itertools import count
 from operator import itemgetter
@@ -97,13 +98,14 @@ class Hearing:
             if letter is None:
                 break
             came.append(((j, stage), letter))
-        for channel, letter in came:
-            self._take(channel, letter)
-        return len(came) == len(awaiting)
+        heard = [self._take(channel, letter) or self._take_next(channel) for channel, letter in came]
+        return sum(heard) == len(awaiting)
 
     def drain(self, of: NodeId | None = None, until_ns: int | None = None) -> None:  # noqa: ARG002
         """Take all that is there, of one neighbour or of all; where it is known, what was there by a time."""
-        self._inbox.drain(self._decoders if of is None else self.channels(of), self._take)
+        for channel in self._decoders if of is None else self.channels(of):
+            while self._take_next(channel):
+                pass
 
     def end(self) -> None:
         """Take all that has come, whether or not it is due: there will be no later."""
@@ -118,11 +120,20 @@ class Hearing:
         """A neighbour's messages that have come and are not there for the node yet."""
         return []
 
-    def _take(self, channel: Channel, letter: Letter) -> None:
+    def _take(self, channel: Channel, letter: Letter) -> bool:
+        """Whether it is a message."""
+        message = self._decoded(channel, letter[0])
+        return message is not None and self._give(channel, message, letter)
+
+    def _take_next(self, channel: Channel) -> bool:
+        """Take the next message that is there, if any: what is none is passed by in no time, however much of it."""
+        found = self._inbox.poll(channel, partial(self._decoded, channel))
+        return found is not None and self._give(channel, *found)
+
+    def _give(self, channel: Channel, message: Message, letter: Letter) -> bool:
         data, looked_ns, received_ns = letter
-        message = self._decoded(channel, data)
-        if message is not None:
-            self._listener.hear(Heard(channel, data, message, looked_ns, received_ns, None))
+        self._listener.hear(Heard(channel, data, message, looked_ns, received_ns, None))
+        return True
 
     def _decoded(self, channel: Channel, data: bytes) -> Message | None:
         node = self._listener.node

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
@@ -21,7 +21,7 @@ import zenoh
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.transport import on_zenoh_thread
 
-Channel = TypeVar("Channel", bound=Hashable)
+Content = TypeVar("Content")
 
 Letter = tuple[bytes, int, int | None]
 """(payload, when it was looked at, when it had come to this machine: known where its sender asked for that stamp)."""
@@ -148,14 +148,6 @@ class Inbox:
 
         self._posters.append(self._session.declare_subscriber(key, on_zenoh_thread(post)))
 
-    def poll(self, source: Hashable) -> Letter | None:
-        """The next message, if there is one."""
-        while (sample := self.poll_sample(source)) is not None:
-            letter = self._letter(sample)
-            if letter is not None:
-                return letter
-        return None
-
     def poll_sample(self, source: Hashable) -> Any | None:
         """The next message as Zenoh gives it, which may be the bell, if there is one."""
         return self._channels[source].handler.try_recv()
@@ -193,11 +185,14 @@ class Inbox:
         self._alarm.set()
         self._nudge.set()
 
-    def drain(self, sources: Iterable[Channel], take: Callable[[Channel, Letter], None]) -> None:
-        """Take all that has arrived from the given sources."""
-        for source in sources:
-            while (letter := self.poll(source)) is not None:
-                take(source, letter)
+    def poll(self, source: Hashable, opened: Callable[[bytes], Content | None]) -> tuple[Content, Letter] | None:
+        """The first message that has arrived and of which `opened` makes anything; those before it are gone."""
+        receive = self._channels[source].handler.try_recv
+        while (sample := receive()) is not None:
+            data: bytes = sample.payload.to_bytes()
+            if data != self._bell and (content := opened(data)) is not None:
+                return content, (data, self._now(), self._received(sample))
+        return None
 
     def close(self) -> None:
         """Stop receiving; what is still in the channels is dropped."""
@@ -214,11 +209,11 @@ class Inbox:
         data: bytes = sample.payload.to_bytes()
         if data == self._bell:
             return None
-        stack = sample.timestamp_stack
-        return data, self._now(), None if stack is None else self._received(stack)
+        return data, self._now(), self._received(sample)
 
-    def _received(self, stack: Any) -> int | None:
-        for record in stack.records:
+    def _received(self, sample: Any) -> int | None:
+        stack = sample.timestamp_stack
+        for record in () if stack is None else stack.records:
             if record.point == zenoh.InterceptionPoint.RECEIVE:
                 stamp: int = record.timestamp().get_time_as_ntp64().as_nanos()
                 return self._clock.of_machine(stamp)

@@ -51,6 +51,10 @@ log = logging.getLogger(__name__)
 REPORT_NS = 250_000_000
 """How often a node tells its launcher how it is doing."""
 
+LOOK_NS = 50_000_000
+"""How often a node that rests until its next step looks at what comes: a channel has room for many messages, and how
+large they are is the sender's choice."""
+
 LINGERLESS_NS = 1_000_000_000
 """How often a node sees to the links that it was not told of; shorter than their lease."""
 
@@ -318,12 +322,14 @@ class LiveNode:
             step += 1
 
     def _await_due(self, due: int) -> int:
-        """Sleep until a paced step is due; then take what has come meanwhile."""
-        while not self.stopping and not self._hearing.rest(due):
-            self._presence.handle_notices()
+        """Sleep until a paced step is due, and take what comes meanwhile: it is not to fill the memory."""
+        while True:
             self._hearing.drain(until_ns=due)  # what comes later is looked at when the step has begun: it may be late
-        self._hearing.drain(until_ns=due)
-        return due
+            now = self._now()
+            if self.stopping or now >= due:
+                return due
+            if not self._hearing.rest(min(due, now + LOOK_NS)):
+                self._presence.handle_notices()
 
     def _suffer(self, node: Node, step: int, epoch_ns: int) -> None:
         """What is planned to happen to this node when it is to begin the step."""
