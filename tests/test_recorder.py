@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from math import nan
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import msgpack
@@ -13,6 +14,7 @@ import pytest
 import zenoh
 
 from swarms import EXAMPLE, wait_until
+from test_flood import lies
 from zfusion import keys
 from zfusion.drivers import inbox as inbox_module
 from zfusion.drivers import recorder as recorder_module
@@ -20,8 +22,8 @@ from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.drivers.recorder import Recorder
 from zfusion.drivers.transport import open_session
-from zfusion.errors import RunError
-from zfusion.messages import MAX_MESSAGE_BYTES
+from zfusion.errors import MessageError, RunError
+from zfusion.messages import MAX_MESSAGE_BYTES, read_stamp
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.recording import Recording, RecordingWriter
 from zfusion.stages import MEASUREMENT
@@ -147,6 +149,40 @@ def test_what_a_forger_numbers_is_not_missing(studio: Studio) -> None:
         assert accounts is not None
         account = accounts[keys.stage_key(RUN, 3, "measurement")]
     assert (account.received, account.unreadable, account.lost, account.restarts) == (2, 4, 0, 0)
+
+
+def test_lies_on_every_key_are_recorded_as_what_was_on_the_wire_and_take_no_account_in(studio: Studio) -> None:
+    """Also on those that no node listens to: estimates, arrivals, events, the truth."""
+    stages = ("measurement", "intermediate", "estimate", "event", "arrivals", "revised")
+    every = [keys.stage_key(RUN, node, stage) for node in (1, 2, 3, 4) for stage in stages] + [keys.truth_key(RUN)]
+    foreign = {key for key in every if key.endswith("/revised")}  # of a scenario that revises nothing
+    pool = [lie for lie in lies(Random(2)) if not is_own_word(lie)]
+    for number, lie in enumerate(pool):
+        studio.measurement(1, number)
+        for key in every:
+            studio.put(key, lie)
+    assert studio.ask() == len(pool) * (len(every) - len(foreign) + 1)
+    report = studio.finish()
+    assert (report.lost, report.foreign, report.unrecorded) == ({}, len(pool) * len(foreign), 0)
+    with Recording.open(studio.path) as recording:
+        assert recording.complete
+        assert set(recording.topics) == set(every) - foreign
+        records = list(recording.records())
+        assert recording.statistics is not None
+        account = recording.statistics[keys.stage_key(RUN, 1, "measurement")]
+    assert (account.received, account.unreadable) == (len(pool), len(pool))
+    honest = [r.data for r in records if r.topic == keys.stage_key(RUN, 1, "measurement")][::2]
+    assert [msgpack.unpackb(data)["seq"] for data in honest] == list(range(len(pool)))
+    assert sorted(r.data for r in records if r.topic == keys.truth_key(RUN)) == sorted(pool)
+
+
+def is_own_word(data: bytes) -> bool:
+    """Whether somebody of the scenario might have said it: a lie all the same, but not by its looks."""
+    try:
+        read_stamp(data)
+    except MessageError:
+        return False
+    return True
 
 
 def test_what_is_not_of_the_scenario_is_counted_and_not_recorded(studio: Studio) -> None:
