@@ -49,7 +49,6 @@ def test_each_host_with_nothing_but_its_folder(tmp_path: Path, topology: str) ->
     assert verdict.code == 0, verdict.err
 
 
-@pytest.mark.long
 def test_a_router_that_is_killed_and_started_again(tmp_path: Path) -> None:
     """Nobody ends for it, and all find each other again; what was lost meanwhile is told."""
     plan = deployed(tmp_path, hosts_document("router"), steps=100_000, timing={"rate_hz": 20.0})

@@ -9,6 +9,7 @@ the plants between the vertices, but closer to the worst case than any.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from zfusion.errors import InputError
 from zfusion.methods.convex import DesignError, minimiser
 from zfusion.methods.gramians import lyapunov, spectral_radius
-from zfusion.methods.stationary.cost import Gains, best_output, extended, gradients
+from zfusion.methods.stationary.cost import Gains, best_output, extended, gradients, rescaled
 from zfusion.methods.stationary.doubt import Doubted
 from zfusion.methods.stationary.problem import Plant, Problem
 from zfusion.model.types import Array
@@ -28,10 +29,14 @@ NO_COST = 1e6
 STABLE = 0.99999
 """Spectral radius from which on it is nearly unstable."""
 
-SHARPNESS = 800.0
-"""Of the soft maximum, times the ratio of a cost to that of the start: costs 0.1 % apart count as 1 to 2.2."""
+SHARPNESSES = (100.0, 400.0, 1600.0, 6400.0)
+"""Of the soft maximum, in turn, times the ratio of a cost to that of the start: at the last one costs that are 0.1 %
+apart count as 1 to 600. The sharp one alone creeps along the edges where two vertices cost the same."""
 
 OPTIONS = {"maxiter": 2000, "maxfun": 4000, "ftol": 1e-10, "gtol": 1e-9, "maxcor": 30}
+
+SHARP_OPTIONS = OPTIONS | {"maxiter": 400, "maxfun": 800}
+"""At each sharpness."""
 
 DOUBT_OPTIONS = OPTIONS | {"maxiter": 300, "maxfun": 600, "ftol": 1e-7}
 """With doubt, where the last digits do not matter."""
@@ -56,17 +61,29 @@ def refine(problem: Problem, start: Gains, doubt: float = 0.0, *, observer: bool
         raise InputError("stationary: a descent with doubt is for one plant, not for a polytope")
     if doubt and observer:
         raise InputError("stationary: a descent with doubt is not for the observer type")
-    search: _Nominal
     if observer:
-        search = _Observer(problem, start)
-    elif doubt:
-        search = _WithDoubt(problem, start, doubt)
-    else:
-        search = _Polytope(problem, start) if len(problem.vertices) > 1 else _Nominal(problem, start)
-    found = minimiser()(
-        search.cost, search.pack(start), jac=True, method="L-BFGS-B", options=DOUBT_OPTIONS if doubt else OPTIONS
-    )
+        return _descend(_Observer(problem, start), start, OPTIONS)
+    if doubt:
+        return _descend(_WithDoubt(problem, start, doubt), start, DOUBT_OPTIONS)
+    if len(problem.vertices) > 1:
+        return _sharper_and_sharper(problem, start)
+    return _descend(_Nominal(problem, start), start, OPTIONS)
+
+
+def _descend(search: _Nominal, start: Gains, options: Mapping[str, float]) -> Refined:
+    found = minimiser()(search.cost, search.pack(start), jac=True, method="L-BFGS-B", options=options)
     return Refined(search.unpack(found.x), int(found.nit), str(found.message))
+
+
+def _sharper_and_sharper(problem: Problem, start: Gains) -> Refined:
+    """For a polytope; each time in coordinates that suit what was found by then."""
+    found, iterations = Refined(start, 0, ""), 0
+    for sharpness in SHARPNESSES:
+        gains = found.gains
+        balanced = rescaled(problem, gains, _covariance(problem.nominal, gains.F, gains.G))
+        found = _descend(_Polytope(problem, start, sharpness), balanced, SHARP_OPTIONS)
+        iterations += found.iterations
+    return found._replace(iterations=iterations)
 
 
 class _Nominal:
@@ -165,10 +182,10 @@ class _WithDoubt(_Nominal):
 class _Polytope(_Nominal):
     """The soft maximum of the vertices' costs as a function of the free entries of F, G and H."""
 
-    def __init__(self, problem: Problem, start: Gains) -> None:
+    def __init__(self, problem: Problem, start: Gains, sharpness: float) -> None:
         super().__init__(problem, start)
         costs = [self._vertex(plant, start)[0] for plant in problem.vertices]
-        self._sharpness = SHARPNESS / max(costs)
+        self._sharpness = sharpness / max(costs)
 
     def pack(self, gains: Gains) -> Array:
         """The free entries in a row."""
