@@ -11,6 +11,7 @@ import pytest
 import zenoh
 
 from swarms import wait_until
+from zfusion.drivers import inbox as inbox_module
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import POSTED, POSTED_BYTES, STRETCH_NS, Inbox, Letter, Posted, Wake
@@ -73,11 +74,9 @@ def payload(letter: Letter | None) -> bytes | None:
 
 def arrived(pair: Pair, name: str) -> list[bytes]:
     """All that is there."""
-    found = []
-    while (opened := pair.inbox.poll(name, bytes)) is not None:
-        assert opened[0] == opened[1][0]
-        found.append(opened[0])
-    return found
+    found = list(pair.inbox.arrived(name, bytes))
+    assert all(content == letter[0] for content, letter in found)
+    return [content for content, _ in found]
 
 
 @pytest.fixture
@@ -202,6 +201,30 @@ def test_nothing_is_lost_or_reordered_whatever_ends_the_waits(pair: Pair) -> Non
     assert arrived(pair, "b") == []
 
 
+def test_taking_what_arrives_has_an_end_though_more_arrives_all_the_while(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair.subscribe("a")
+    monkeypatch.setattr(inbox_module, "CHANNEL", 10)
+    for number in range(25):
+        pair.put("a", b"%d" % number)
+    wait_until(lambda: pair.inbox.poll_sample("a"), "the first")  # what was put before them is there by now or later
+    taken: list[int] = []
+
+    def read(data: bytes) -> int | None:
+        taken.append(int(data))
+        return None if int(data) % 2 else int(data)
+
+    def go_on() -> bool:
+        before = len(taken)
+        assert [content for content, _ in pair.inbox.arrived("a", read)] == [n for n in taken[before:] if n % 2 == 0]
+        assert len(taken) <= before + 10
+        return len(taken) == 24
+
+    wait_until(go_on, "the last")
+    assert taken == list(range(1, 25))
+
+
 def test_a_full_channel_does_not_keep_another_one_waiting_for_ever(pair: Pair) -> None:
     pair.subscribe("full", "other", capacity=8)
     for number in range(100):
@@ -223,7 +246,7 @@ def test_closing_with_full_channels_is_quick(pair: Pair) -> None:
     for number in range(50):
         pair.put("a", b"%d" % number)
         pair.put("b", b"%d" % number)
-    wait_until(lambda: pair.inbox.poll("a", bytes), "the channels fill up")
+    wait_until(lambda: arrived(pair, "a"), "the channels fill up")
     assert pair.close() < 5.0
 
 

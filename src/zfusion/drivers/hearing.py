@@ -9,6 +9,7 @@ Both decode what comes and give it to the node's driver; what is no message of t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from heapq import heappop, heappush
 from itertools import count
@@ -104,8 +105,8 @@ class Hearing:
     def drain(self, of: NodeId | None = None, until_ns: int | None = None) -> None:  # noqa: ARG002
         """Take all that is there, of one neighbour or of all; where it is known, what was there by a time."""
         for channel in self._decoders if of is None else self.channels(of):
-            while self._take_next(channel):
-                pass
+            for message, letter in self._arrived(channel):
+                self._give(channel, message, letter)
 
     def end(self) -> None:
         """Take all that has come, whether or not it is due: there will be no later."""
@@ -126,9 +127,11 @@ class Hearing:
         return message is not None and self._give(channel, message, letter)
 
     def _take_next(self, channel: Channel) -> bool:
-        """Take the next message that is there, if any: what is none is passed by in no time, however much of it."""
-        found = self._inbox.poll(channel, partial(self._decoded, channel))
-        return found is not None and self._give(channel, *found)
+        """Take the next message that is there, if any; what is none is passed by."""
+        return any(self._give(channel, message, letter) for message, letter in self._arrived(channel))
+
+    def _arrived(self, channel: Channel) -> Iterator[tuple[Message, Letter]]:
+        return self._inbox.arrived(channel, partial(self._decoded, channel))
 
     def _give(self, channel: Channel, message: Message, letter: Letter) -> bool:
         data, looked_ns, received_ns = letter

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
@@ -185,14 +185,19 @@ class Inbox:
         self._alarm.set()
         self._nudge.set()
 
-    def poll(self, source: Hashable, opened: Callable[[bytes], Content | None]) -> tuple[Content, Letter] | None:
-        """The first message that has arrived and of which `opened` makes anything; those before it are gone."""
+    def arrived(self, source: Hashable, read: Callable[[bytes], Content | None]) -> Iterator[tuple[Content, Letter]]:
+        """The messages that have arrived and of which `read` makes anything, taken as they are asked for.
+
+        Ends after a whole channel at the latest: those who send may be quicker than we are.
+        """
         receive = self._channels[source].handler.try_recv
-        while (sample := receive()) is not None:
+        for _ in range(CHANNEL):
+            sample = receive()
+            if sample is None:
+                return
             data: bytes = sample.payload.to_bytes()
-            if data != self._bell and (content := opened(data)) is not None:
-                return content, (data, self._now(), self._received(sample))
-        return None
+            if data != self._bell and (content := read(data)) is not None:
+                yield content, (data, self._now(), self._received(sample))
 
     def close(self) -> None:
         """Stop receiving; what is still in the channels is dropped."""
