@@ -134,6 +134,18 @@ def test_a_file_that_a_scenario_reads_is_part_of_the_hash(tmp_path: Path) -> Non
     assert planned(tmp_path, text).points[0].seeds[0].hash != before
 
 
+def test_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    text = HEAD + 'set = { "links.delay" = { trace = "a/x" }, method = { name = "stationary", design = "b/x" } }\n'
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x").write_text("0.01\n0.02\n")
+    hashes = [planned(tmp_path, text).points[0].seeds[0].hash]
+    for folder in "ab":
+        (tmp_path / folder / "x").write_text("0.01\n0.03\n")
+        hashes.append(planned(tmp_path, text).points[0].seeds[0].hash)
+    assert len(set(hashes)) == 3
+
+
 def test_a_design_file_is_part_of_the_hash_of_runs_only(tmp_path: Path) -> None:
     """What is predicted of a scenario is for the two-stage filter, whatever method the runs are of."""
     text = HEAD + 'set = { method = { name = "stationary", design = "d.npz" } }\n'

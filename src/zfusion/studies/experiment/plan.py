@@ -172,7 +172,7 @@ def _point(experiment: Experiment, number: int, choice: Choice, scenario: Scenar
     }
     seeds = tuple(Task(_hash({**facts, "seed": seed}), spec.world, text, seed, spec.burn_in) for seed in spec.seeds)
     known = {key: document[key] for key in THEORY_FACTS if key in document}
-    theory = {**facts, "world": THEORY, "scenario": known, "files": {}}
+    theory = {**facts, "world": THEORY, "scenario": known, "files": []}
     labels = {path: value.label for path, value in choice}
     return Point(number, labels, scenario, seeds, Task(_hash(theory), THEORY, text, 0, spec.burn_in))
 
@@ -183,13 +183,13 @@ def _hash(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _files(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of the files that a scenario reads, by the names that it has for them."""
-    found: dict[str, str] = {}
+def _files(scenario: Scenario) -> list[tuple[str, str]]:
+    """Names and SHA-256 of the files that a scenario reads, in its order; where they are does not matter."""
+    found: list[tuple[str, str]] = []
 
     def note(path: str) -> str:
         if Path(path).is_file():
-            found[Path(path).name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+            found.append((Path(path).name, hashlib.sha256(Path(path).read_bytes()).hexdigest()))
         return path
 
     for i in scenario.ids:
