@@ -158,6 +158,17 @@ def test_who_begins_late_takes_up_the_line_of_its_machine(tmp_path: Path) -> Non
     assert watched.watch.offsets[2].told() == {"offset_us": 0.0, "uncertainty_us": 0.0}
 
 
+def test_the_line_of_one_that_is_still_to_take_it_up_is_not_looked_at(tmp_path: Path) -> None:
+    watched = Watched(tmp_path)
+    line = watched.clock.line_ns
+    for phase, line_ns in ((Phase.RUNNING, line), (Phase.JOINING, line + HOUR), (Phase.RUNNING, line)):
+        watched.watch.read(answer(2, phase=phase, machine="here", line_ns=line_ns), "here", 0, 0, begun=True)
+        assert watched.watch.offsets[2].told() == {"offset_us": 0.0, "uncertainty_us": 0.0}
+    watched.watch.read(answer(2, phase=Phase.RUNNING, machine="here", line_ns=line + HOUR), "here", 0, 0, begun=True)
+    assert watched.watch.offsets[2].told() == {"offset_us": HOUR / 1000, "uncertainty_us": 0.0}
+    assert watched.watch.exceeded == 1
+
+
 class Box:
     """A machine of which zfusion's processes read what a test wants: its clock, and what its boot is called."""
 

@@ -267,6 +267,24 @@ def test_a_given_epoch_that_is_over_is_no_reason_to_skip_steps() -> None:
     assert start.born == 1001
 
 
+def test_clocks_are_not_judged_before_all_have_answered_who_are_to_be_waited_for() -> None:
+    """One that has not may be on the same machine, and its time line the one that counts."""
+    town = Town(line(1, 2, 3), (1, 2, 3), period=PERIOD)
+    town.begin_all()
+    town.remove(2)
+    meeting = town.add(2).meeting
+    statuses = {node: town.peers[node].status() for node in (1, 3)}
+    meeting.went(1)  # that is: it has not been seen yet
+    meeting.answered(statuses[3])
+    assert meeting.agrees_with(town.now) == frozenset()
+    assert meeting.agrees_with(town.now, begins=True) == {3}
+    assert meeting.agrees_with(town.now + JOIN_NS) == {3}  # nobody else is there
+    meeting.came(1)
+    assert meeting.agrees_with(town.now + JOIN_NS) == frozenset()
+    meeting.answered(statuses[1])
+    assert meeting.agrees_with(town.now) == {1, 3}
+
+
 def test_another_scenario_is_refused_and_both_are_named() -> None:
     town = Town(line(1, 2), (1, 2))
     town.add(1)

@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ from zfusion.recording import Recording
 from zfusion.swarm.netns import kernel
 from zfusion.swarm.netns.addresses import Place, places
 from zfusion.swarm.netns.netem import NetemNetwork, missing
-from zfusion.swarm.netns.wires import wire_up
+from zfusion.swarm.netns.wires import SYSTEM_PATH, wire_up
 
 NODES = ["1", "2", "3", "4"]
 MS = 1_000_000
@@ -64,6 +65,7 @@ def why_no_netem() -> str | None:
 
 
 TROUBLE = in_a_thread_of_its_own(make_one) if sys.platform == "linux" else "not Linux"
+TC = which("tc", path=f"{os.environ['PATH']}:{SYSTEM_PATH}")
 NO_NETEM = in_a_thread_of_its_own(why_no_netem) if TROUBLE is None else TROUBLE
 
 pytestmark = pytest.mark.skipif(TROUBLE is not None, reason=f"no network namespaces here: {TROUBLE}")
@@ -353,6 +355,7 @@ def exchange(namespaces: dict[Any, int], where: list[Place]) -> bytes:
         return other.recv(100)
 
 
+@pytest.mark.skipif(TC is None, reason="there is no tc (of iproute2)")
 def test_all_of_the_network_of_netem_but_netem_itself(tmp_path: Path) -> None:
     """Bridge, veth pairs, classes and filters, with another queue in the place of netem: any kernel has that."""
 
@@ -368,7 +371,7 @@ def test_all_of_the_network_of_netem_but_netem_itself(tmp_path: Path) -> None:
             own.append(network.hub)
             heard = exchange(namespaces, where)
             shown = subprocess.run(
-                ["tc", "-s", "class", "show", "dev", "p1"], capture_output=True, text=True, check=True
+                [TC or "tc", "-s", "class", "show", "dev", "p1"], capture_output=True, text=True, check=True
             )
             return heard, shown.stdout
         finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -153,7 +154,8 @@ def test_a_node_tells_systemd_and_the_probe(tmp_path: Path, monkeypatch: pytest.
         with alone(tmp_path) as node:
             wait_until(lambda: systemd.said("READY=1"), "ready")
             wait_until(lambda: systemd.said("WATCHDOG=1"), "a sign of life")
-            wait_until(lambda: systemd.said("STATUS=running: step "), "the step")
+            completed = re.compile(r"STATUS=running: step \d+, [1-9]\d* completed")
+            wait_until(lambda: any(map(completed.search, systemd.heard())), "a step that is completed")
             assert Health.read(file).ready
             assert Health.read(file).pid == node.process.pid
             node.process.send_signal(signal.SIGSTOP)

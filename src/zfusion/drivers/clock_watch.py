@@ -62,7 +62,7 @@ class ClockWatch:
         """What an answer tells of its sender's clock; `on_machine` is what this node tells of its own machine.
 
         A node that has not begun takes up the time line of one on its machine that has: the clock may have been set
-        since.
+        since. The line of one that is still to take up this node's is not to be looked at.
         """
         offset = self.offsets.get(status.node)
         if offset is None:
@@ -71,6 +71,8 @@ class ClockWatch:
         if offset.same_machine:
             if not begun and status.phase is Phase.RUNNING:
                 self._clock.join(status.line_ns)
+            if begun and status.phase is Phase.JOINING:
+                return
             offset.lines_apart_ns = status.line_ns - self._clock.line_ns
         else:
             offset.read(asked_ns, status.heard_ns, status.told_ns, answered_ns)

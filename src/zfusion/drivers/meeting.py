@@ -92,14 +92,17 @@ class Meeting:
         absent += ["the recorder"] if self.needs_recorder and not self.recorder else []
         return absent or [f"node {j} to be ready" for j in sorted(self.swarm - self.ready.keys(), key=str)]
 
-    def agrees_with(self) -> frozenset[NodeId]:
+    def agrees_with(self, now: int, *, begins: bool = False) -> frozenset[NodeId]:
         """Whose clocks must agree with this node's before it begins: those of the nodes that run, or else of all.
 
-        Also of one that has gone meanwhile: it may have been the first to refuse. Empty until all who are there have
-        answered, as one of them may be running.
+        Also of one that has gone meanwhile: it may have been the first to refuse. Empty until all have answered that
+        are to be waited for, unless this node `begins` without them: one of them may be running, or be on this node's
+        machine, whose time line it takes up then.
         """
         running = frozenset(j for j, status in self.heard.items() if status.phase is Phase.RUNNING)
-        return running or (self.linked if self.present <= self.heard.keys() else frozenset())
+        if running:
+            return running if begins or self._awaited(now) <= self.heard.keys() else frozenset()
+        return self.linked if begins or self.present <= self.heard.keys() else frozenset()
 
     def start(self, now: int) -> Start | None:
         """When to begin, if that can be said yet."""
@@ -122,14 +125,17 @@ class Meeting:
         running = [
             s for s in self.heard.values() if s.phase is Phase.RUNNING and s.ready.get(self.own) != self.started_ns
         ]
-        awaited = self.linked if now < self.started_ns + self.moved_ns + JOIN_NS else self.present
-        if not running or not awaited <= self.heard.keys():
+        if not running or not self._awaited(now) <= self.heard.keys():
             return None
         epoch = self.epoch_ns if self.epoch_ns is not None else now
         born = max(s.step for s in running) + 1
         if self.period_ns is not None:
             born = max(1, (now - epoch) // self.period_ns + 1)
         return Start(born, epoch, self.hears & {s.node for s in running})
+
+    def _awaited(self, now: int) -> frozenset[NodeId]:
+        """Whose answers a node that finds others running waits for."""
+        return self.linked if now < self.started_ns + self.moved_ns + JOIN_NS else frozenset(self.present)
 
     def _begin_without_the_rest(self, now: int) -> Start | None:
         """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there."""

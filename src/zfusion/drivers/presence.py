@@ -139,19 +139,16 @@ class Presence:
         while not self._host.stopping:
             try:
                 self.handle_notices()
-                self.clocks.agree(self.meeting.agrees_with())
+                now = self._now()
+                if moved := self._clock.line_ns - line:
+                    line += moved
+                    next_poll += moved
+                    next_word += moved
+                    self.meeting.moved_ns += moved
+                start = self._try_to_begin(now)
             except InputError:
                 self._be_refused()
                 raise
-            now = self._now()
-            if moved := self._clock.line_ns - line:
-                line += moved
-                next_poll += moved
-                next_word += moved
-                self.meeting.moved_ns += moved
-            self._claims.check(now)
-            self._show_token()
-            start = None if self._claims.contested else self.meeting.start(now)
             if start is not None:
                 self._clock.keep()
                 self.clocks.tell_unknown(self.meeting.present)
@@ -170,6 +167,15 @@ class Presence:
                     self._prober.look()
             self._inbox.rest(next_poll)
         return None
+
+    def _try_to_begin(self, now: int) -> Start | None:
+        self.clocks.agree(self.meeting.agrees_with(now))
+        self._claims.check(now)
+        self._show_token()
+        start = None if self._claims.contested else self.meeting.start(now)
+        if start is not None:
+            self.clocks.agree(self.meeting.agrees_with(now, begins=True))
+        return start
 
     def take_leave(self) -> None:
         """Stay until everybody that listens has the last messages, and this node theirs.

@@ -8,11 +8,15 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
+from shutil import which
 
 from zfusion.errors import InputError
 from zfusion.model.types import NodeId
 from zfusion.swarm.netns import kernel
 from zfusion.swarm.netns.addresses import Place
+
+SYSTEM_PATH = "/usr/sbin:/sbin"
+"""Where `tc` is, and what is not on everybody's PATH."""
 
 NODES_END = "recorder"
 """The device at the node's end; at the recorder's they are numbered."""
@@ -41,9 +45,14 @@ def veth(name: str, peer: str, namespace: int) -> str:
 
 def run(program: str, commands: Sequence[str]) -> None:
     """Have `ip` or `tc` carry out commands in this thread's namespace; InputError with its words where it does not."""
+    path = f"{os.environ.get('PATH', os.defpath)}:{SYSTEM_PATH}"
     try:
         done = subprocess.run(
-            [program, "-batch", "-"], input="\n".join(commands), capture_output=True, text=True, check=False
+            [which(program, path=path) or program, "-batch", "-"],
+            input="\n".join(commands),
+            capture_output=True,
+            text=True,
+            check=False,
         )
     except FileNotFoundError:
         raise InputError(f"there is no {program} (of iproute2)") from None
