@@ -230,6 +230,7 @@ def test_who_finds_nobody_to_join_any_more_is_not_waited_for() -> None:
     through, late = child(1, "done", ended=True), child(2, "joining")
     assert latecomers([through, late]) == [late]
     assert latecomers([child(1, "joining"), late]) == []  # they wait for each other
+    assert latecomers([late]) == []  # it waits for nobody
     assert latecomers([through, late, child(3, "running")]) == []
     assert latecomers([through, late, child(3, "done")]) == []  # which stays for whom it has not told all
     again = child(3, "joining", restarts=1)

@@ -15,13 +15,14 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
-from zfusion.drivers.endpoints import dialled
+from zfusion.drivers.endpoints import dialled, links_of
+from zfusion.drivers.meeting import connected
 from zfusion.drivers.metrics import NodeReport, RecorderReport
 from zfusion.drivers.registry import Entry, registered
 from zfusion.errors import InputError
@@ -146,6 +147,9 @@ class Launcher:
         self._clock = Clock()
         self._clock.keep()
         self._standstill = Standstill()
+        links = links_of(scenario)
+        self._parts = {connected(i, links) for i in scenario.ids}
+        """Nodes that wait for each other."""
         self._dismissed: set[str] = set()
         """Nodes that came too late."""
         self._begun = False
@@ -319,7 +323,7 @@ class Launcher:
                 return
 
     def _dismiss_latecomers(self) -> None:
-        for child in latecomers(self._nodes.values()):
+        for child in chain.from_iterable(latecomers([self._nodes[i] for i in part]) for part in self._parts):
             if not child.restarts and child.name not in self._dismissed:
                 self._dismissed.add(child.name)
                 self._failures.append(f"{child.name} had not begun when all others had ended")
@@ -511,10 +515,13 @@ class Launcher:
 
 
 def latecomers(nodes: Collection[Child]) -> list[Child]:
-    """Nodes that find nobody to join any more: all others have taken their steps and ended.
+    """Of connected nodes, those that find nobody to join any more: all others have taken their steps and ended.
 
-    They were started again; or the machine was so busy that the others were through before these had begun.
+    They were started again; or the machine was so busy that the others were through before these had begun. One that is
+    connected with nobody begins whenever it comes.
     """
+    if len(nodes) == 1:
+        return []
     running = [child for child in nodes if child.running]
     again = all(child.restarts and child.status.get("phase") != "running" for child in running)
     ended = len(running) < len(nodes) and all(child.status.get("phase") == "joining" for child in running)
