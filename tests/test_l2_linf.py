@@ -146,14 +146,17 @@ def test_alternation_of_the_reference(
     check_zeros(problem, found.gains)
 
 
-# certified gamma, worst deterministic w: from the slack's design, and from the paper's
+# the reference's certified gamma and worst deterministic w, from the slack's design and from the paper's; gamma here
 ALTERNATED = {
-    ("slack", SURE): (0.4061, 0.4029),
-    ("slack", MISSING): (0.5398, 0.5320),
-    ("paper", SURE): (0.4065, 0.4025),
-    ("paper", MISSING): (0.5456, 0.5371),
-    ("paper, in other units", SURE): (0.4065, 0.4025),
+    ("slack", SURE): (0.4061, 0.4029, 0.4061),
+    ("slack", MISSING): (0.5398, 0.5320, 0.5384),
+    ("paper", SURE): (0.4065, 0.4025, 0.4062),
+    ("paper", MISSING): (0.5456, 0.5371, 0.5440),
 }
+NOT_REACHED = pytest.param(
+    *("paper, in other units", SURE),
+    marks=pytest.mark.xfail(strict=True, reason="from a start that differs by 1e-8 it ends at 0.4068, not 0.4065"),
+)
 STARTS: dict[str, Callable[[tuple[float, ...]], Gains]] = {
     "slack": lambda arrival: slack_filters(arrival, -0.1).gains,
     "paper": lambda arrival: diagonal_design(switching(arrival)).gains,
@@ -163,7 +166,7 @@ STARTS: dict[str, Callable[[tuple[float, ...]], Gains]] = {
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(("start", "arrival"), ALTERNATED)
+@pytest.mark.parametrize(("start", "arrival"), [*ALTERNATED, NOT_REACHED])
 def test_alternation_that_has_converged_is_where_the_reference_is_or_better(
     start: str, arrival: tuple[float, ...]
 ) -> None:
@@ -173,13 +176,14 @@ def test_alternation_that_has_converged_is_where_the_reference_is_or_better(
     design in two units of the noises, whose gains differ by 1e-8, it ends at 0.4062 and at 0.4068, the reference
     between them.
     """
-    gamma, worst = ALTERNATED[start, arrival]
+    gamma, worst, ends = ALTERNATED[start.partition(",")[0], arrival]
     problem = switching(arrival)
     found = alternate(problem, STARTS[start](arrival))
     reached = worst_disturbance(problem, found.gains).gain
-    beyond = 3 * DIGITS if start != "slack" and arrival is SURE else DIGITS
-    assert 0.997 * gamma < found.certificate.gamma <= gamma + beyond
-    assert reached <= min(found.certificate.gamma, worst + 3 * DIGITS)
+    assert reached <= found.certificate.gamma <= gamma + DIGITS
+    assert found.certificate.gamma == pytest.approx(ends, abs=3 * DIGITS)
+    if arrival is SURE:
+        assert reached == pytest.approx(worst, abs=3 * DIGITS)
     again = certify(problem, found.gains)  # which proves its numbers by eigenvalues
     assert again.gamma == pytest.approx(found.certificate.gamma, rel=1e-5)
 
