@@ -1,6 +1,7 @@
 """A peer that floods every key of a live run with lies: what the others estimate is what they would without it.
 
-Some hundred messages a key here; by
+One is a stranger in a swarm that lets everybody in; the other a member of a deployed swarm, whose certificate is good
+at every node's door: rules refuse all that he says in other names. Some hundred messages a key here; by
 
     ZFUSION_FLOOD=100000 python -m pytest -m long -s tests/test_flood.py
 
@@ -14,16 +15,21 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import pytest
 import zenoh
 
-from swarms import Listener, client, decoded, endpoints, estimates, wait_until, zfusion
+from deployed import deployed, hosts_document, process, swarm
+from swarms import Listener, client, decoded, endpoints, estimates, recorded, wait_until, zfusion
 from test_hostile import Attack, attacked, header, intermediates, measurements, nonsense, pack
+from test_security import Doors
+from zfusion.deploy.plan import Plan
 from zfusion.recording import Recording
 
 NODES = (1, 2, 3, 4)
@@ -77,13 +83,14 @@ def wrong_answers(attack: Attack) -> Iterator[Counter[str]]:
             queryable.undeclare()
 
 
-def pour(attack: Attack, number: int, where: str = "") -> None:
-    """So many lies on every key, or on keys that begin with `where`, which nobody listens to."""
+def pour(puts: Sequence[Callable[[str, bytes], object]], number: int, where: str = "") -> None:
+    """So many lies on every key, in each of these ways; or on keys that begin with `where`, which nobody listens to."""
     pool = lies(Random(1))
     keys = [f"{where}node/{i}/{stage}" for i in NODES for stage in STAGES] + [f"{where}truth"]
     for n in range(number):
         for k, key in enumerate(keys):
-            attack.put(key, pool[(n + k) % len(pool)])
+            for put in puts:
+                put(key, pool[(n + k) % len(pool)])
 
 
 def ask(attack: Attack, number: int) -> None:
@@ -101,10 +108,11 @@ def ask(attack: Attack, number: int) -> None:
 
 
 class Watch:
-    """How far node 1 is, seen by somebody who has no link to the one who floods."""
+    """How far a node is, seen by somebody who has no link to the one who floods."""
 
-    def __init__(self, session: zenoh.Session, run: str) -> None:
-        self._heard = Listener(session, f"zfusion/{run}/node/1/estimate")
+    def __init__(self, session: zenoh.Session, run: str, node: int) -> None:
+        self._node = node
+        self._heard = Listener(session, f"zfusion/{run}/node/{node}/estimate")
 
     def step(self) -> int:
         samples = self._heard.collect()
@@ -112,7 +120,7 @@ class Watch:
         return int(decoded(samples[-1])["step"]) if samples else 0
 
     def wait_for(self, step: int) -> None:
-        wait_until(lambda: self.step() >= step, f"step {step} of node 1, not {self.step()}", 600)
+        wait_until(lambda: self.step() >= step, f"step {step} of node {self._node}, not {self.step()}", 600)
 
     def rate(self, act: Callable[[], object]) -> float:
         """Steps a second, while something is done."""
@@ -120,18 +128,49 @@ class Watch:
         act()
         return (self.step() - first) / (time.monotonic() - began)
 
+    def calm(self, number: int) -> float:
+        """Steps a second, while nobody lies."""
+        return self.rate(lambda: self.wait_for(self.step() + max(50, number // 100)))
 
-def endure(directory: Path, number: int, questions: int) -> None:
+
+@dataclass(frozen=True)
+class Rates:
+    """Rounds a second."""
+
+    before: float
+    beside: float
+    """Beside as many messages that nobody hears."""
+    during: float
+    after: float
+
+    def tell(self) -> None:
+        print(
+            f"rounds a second: {self.during:.0f} meanwhile; {self.before:.0f} before ({self.during / self.before:.2f}),"
+            f" {self.after:.0f} after; beside as many messages that nobody hears {self.beside:.0f}"
+            f" ({self.during / self.beside:.2f})"
+        )
+
+
+def same_as_calm(directory: Path, scenario: str, path: Path, steps: int) -> None:
+    """Whether the estimates of so many steps are those that the scenario's nodes make when nobody lies."""
+    calm = ("--free-run", "--steps", steps, "--record", "calm.mcap", "--json")
+    assert zfusion(directory, "simulate", scenario, *calm).code == 0
+    ours, theirs = estimates(path), estimates(directory / "calm.mcap")
+    assert len(theirs) == len(NODES) * steps
+    assert all(ours[place] == estimate for place, estimate in theirs.items())
+
+
+def endure_stranger(directory: Path, number: int, questions: int) -> None:
     with attacked(directory, "--free-run", **PATIENT) as (command, attack, _, path):
         with client(endpoints(directory / "attacked.toml")["1"]) as session:
-            watch = Watch(session, attack.run)
+            watch = Watch(session, attack.run, 1)
             watch.wait_for(SETTLED)
-            before = watch.rate(lambda: watch.wait_for(watch.step() + max(50, number // 100)))
-            beside = watch.rate(lambda: pour(attack, number, "elsewhere/"))
+            before = watch.calm(number)
+            beside = watch.rate(lambda: pour([attack.put], number, "elsewhere/"))
             with wrong_answers(attack):
                 ask(attack, questions)
-                during = watch.rate(lambda: pour(attack, number))
-            after = watch.rate(lambda: watch.wait_for(watch.step() + max(50, number // 100)))
+                during = watch.rate(lambda: pour([attack.put], number))
+            rates = Rates(before, beside, during, watch.calm(number))
         command.interrupt()
         result = command.wait()
     assert result.code == 0, result.err
@@ -143,22 +182,70 @@ def endure(directory: Path, number: int, questions: int) -> None:
     with Recording.open(path) as recording:
         assert recording.complete
     print(f"{number} lies on each of {len(NODES) * len(STAGES) + 1} keys; {refused} refused by the nodes")
-    print(f"rounds a second: {during:.0f} meanwhile; {before:.0f} before ({during / before:.2f}), {after:.0f} after")
-    print(f"beside as many messages that nobody hears: {beside:.0f} ({during / beside:.2f})")
-    steps = min(summary["completed_steps"].values())
-    calm = ("--free-run", "--steps", steps, "--record", "calm.mcap", "--json")
-    assert zfusion(directory, "simulate", "attacked.toml", *calm).code == 0
-    ours, theirs = estimates(path), estimates(directory / "calm.mcap")
-    assert len(theirs) == len(NODES) * steps
-    assert all(ours[place] == estimate for place, estimate in theirs.items())
+    rates.tell()
+    same_as_calm(directory, "attacked.toml", path, min(summary["completed_steps"].values()))
+
+
+def flooded(plan: Plan, out: Path, number: int) -> tuple[Rates, dict[str, dict[str, Any]]]:
+    """A deployed swarm while node 1's certificate floods it; what its processes reported."""
+    with swarm(plan, out) as running, ExitStack() as links:
+        doors = Doors(running)
+        wait_until(running.steps_taken, "steps are taken")
+        watch = Watch(links.enter_context(doors.as_member("observer", 3)), plan.run, 3)
+        watch.wait_for(SETTLED)
+        before = watch.calm(number)
+
+        def at(session: zenoh.Session) -> Callable[[str, bytes], object]:
+            block = zenoh.CongestionControl.BLOCK
+            return lambda key, data: session.put(f"zfusion/{plan.run}/{key}", data, congestion_control=block)
+
+        with ExitStack() as liar:
+            puts = [at(liar.enter_context(doors.as_member("node-1", node))) for node in NODES]
+            beside = watch.rate(lambda: pour(puts, number, "elsewhere/"))
+            during = watch.rate(lambda: pour(puts, number))
+        rates = Rates(before, beside, during, watch.calm(number))
+        running.interrupt()
+        return rates, running.ended()
+
+
+def endure_member(directory: Path, number: int) -> None:
+    plan = deployed(directory, hosts_document("direct"), steps=10_000_000, free_run=True, **PATIENT)
+    rates, reports = flooded(plan, directory / "out", number)
+    print(f"{number} lies on each of {len(NODES) * len(STAGES) + 1} keys at each of {len(NODES)} nodes")
+    rates.tell()
+    nodes = {name: report for name, report in reports.items() if name.startswith("node")}
+    refused = {
+        (name, other): sum(edge["refused"].values())
+        for name, report in nodes.items()
+        for other, edge in report["edges"].items()
+        if edge["refused"]
+    }
+    # What comes in node 1's own name has to be read by those that hear it; everything else is kept from all by rules.
+    assert refused == {("node-3", "1"): 2 * number, ("node-4", "1"): 2 * number}
+    path = directory / "out" / process(plan, "recorder").host / "recordings" / f"{plan.run}.mcap"
+    messages = recorded(path)
+    owners = {(m.topic.split("/")[3], str(m.payload["node"])) for m in messages if "/node/" in m.topic}
+    assert owners == {(str(node), str(node)) for node in NODES}
+    same_as_calm(directory, "field.toml", path, min(report["completed"] for report in nodes.values()))
 
 
 @pytest.mark.timeout(400)
 def test_a_flood_of_lies_on_every_key_changes_no_bit(tmp_path: Path) -> None:
-    endure(tmp_path, 200, 30)
+    endure_stranger(tmp_path, 200, 30)
+
+
+@pytest.mark.timeout(400)
+def test_a_members_flood_on_every_key_goes_no_farther_than_its_own(tmp_path: Path) -> None:
+    endure_member(tmp_path, 200)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_a_long_flood_of_lies_on_every_key_changes_no_bit(tmp_path: Path) -> None:
-    endure(tmp_path, FLOOD, 1000)
+    endure_stranger(tmp_path, FLOOD, 1000)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(7200)
+def test_a_members_long_flood_goes_no_farther_than_its_own_keys(tmp_path: Path) -> None:
+    endure_member(tmp_path, FLOOD)

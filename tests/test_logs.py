@@ -42,9 +42,9 @@ def test_the_processes_of_a_launch_log_json(tmp_path: Path, monkeypatch: pytest.
     warned = [record for record in told if record["message"].startswith("refused from node 2")]
     assert warned[0]["level"] == "warning"
     assert warned[0]["step"] > 0
-    assert "not_msgpack" in warned[0]["message"]
+    assert "not_a_map" in warned[0]["message"]
     assert len(warned) <= 2  # when it began, and what came since at the end
-    refused = result.summary["refused"]["not_msgpack"]
+    refused = result.summary["refused"]["not_a_map"]
     assert f"({refused} so far)" in warned[-1]["message"]
 
 

@@ -266,7 +266,7 @@ def test_no_part_of_a_message_is_a_message_nor_one_with_more_behind_it(stage: St
     assert reason(stage, data + b"\xc0") == Reason.NOT_MSGPACK
 
 
-@pytest.mark.parametrize("data", [b"\x93\x01\x02\x03", b"\xc0", b"\x01", b"\xa3abc"])
+@pytest.mark.parametrize("data", [b"\x93\x01\x02\x03", b"\xc0", b"\x01", b"\xa3abc", b"\xc1", b"noise", b'{"v": 1}'])
 def test_what_is_no_map(data: bytes) -> None:
     assert reason(TRUTH, data) == Reason.NOT_A_MAP
     for read in (read_stamp, decode_any):

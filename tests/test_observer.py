@@ -198,8 +198,8 @@ def _scraped(url: str) -> dict[tuple[Any, ...], float]:
 def test_what_is_broken_is_shown_as_that(directory: Path) -> None:
     good = msgpack.packb({"v": 1, "node": 3, "step": 1, "t_ns": 0, "seq": 0, "born": 1, "x": [float("nan")]})
     payloads = {
-        b"\xc1": "not_msgpack",
-        b"\x1b[2J\x1b]0;owned\x07": "not_msgpack",
+        b"\xc1": "not_a_map",
+        b"\x1b[2J\x1b]0;owned\x07": "not_a_map",
         b"\x81" * 3000: "not_msgpack",
         msgpack.packb([1]): "not_a_map",
         msgpack.packb({"v": 1, "node": 3}): "missing_field",

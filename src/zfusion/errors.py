@@ -66,17 +66,22 @@ class RunError(ZfusionError):
 
 
 class MessageError(ZfusionError):
-    """Bytes from a peer that are not a legal message; `reason` is the counter they are counted under."""
+    """Bytes from a peer that are not a legal message: ``MessageError(reason, detail, *values)``.
 
-    def __init__(self, reason: str, detail: str = "", *values: object) -> None:
-        """`detail` says more of it; {} in it are what `values` look like, cut short, when somebody wants to read it.
+    `reason` is the counter they are counted under. `detail` says more of it; {} in it are what `values` look like, cut
+    short, when somebody wants to read it. Nobody does where such messages are counted only, and a flood of them is to
+    cost as little as can be: nothing is done with any of it before.
+    """
 
-        Nobody does where such messages are counted only, and a flood of them is to cost as little as can be.
-        """
-        self.reason = reason
-        self._detail, self._values = detail, values
-        super().__init__(reason)
+    @property
+    def reason(self) -> str:
+        """What they are counted under."""
+        reason: str = self.args[0]
+        return reason
 
     def __str__(self) -> str:
-        detail = self._detail.format(*map(short, self._values)) if self._values else self._detail
-        return f"{self.reason}: {detail}" if detail else self.reason
+        reason, *more = self.args
+        if not more:
+            return str(reason)
+        detail, *values = more
+        return f"{reason}: {detail.format(*map(short, values)) if values else detail}"
