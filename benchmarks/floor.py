@@ -29,7 +29,7 @@ os.environ.setdefault(
 
 import zenoh
 
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 SIZES = (57, 81)
 """Bytes of a measurement and of an intermediate estimate of the example, once it has settled."""

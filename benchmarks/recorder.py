@@ -28,7 +28,7 @@ from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.transport import open_session, publisher
 from zfusion.messages import encode
 from zfusion.stages import Message
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "four_sensor.toml"
 RUN = "benchmark"

@@ -26,7 +26,8 @@ from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
 from zfusion.model.scenario import load_scenario
-from zfusion.swarm.launch import ONE_THREAD, free_endpoints
+from zfusion.swarm.child import ONE_THREAD
+from zfusion.swarm.ports import free_endpoints
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "four_sensor.toml"
 

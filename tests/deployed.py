@@ -20,7 +20,7 @@ from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan, Process
 from zfusion.drivers.settings import base_settings
 from zfusion.model.scenario import load_scenario
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 SPREAD: Mapping[str, Mapping[str, Any]] = {
     "a": {"nodes": [1, 2]},

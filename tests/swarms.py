@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.transport import open_session
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "four_sensor.toml"
 

@@ -279,7 +279,7 @@ def test_a_published_replay_reaches_a_consumer_whole_and_in_order(simulated: Pat
     from zfusion.drivers.endpoints import Endpoints
     from zfusion.drivers.transport import open_session
     from zfusion.recording import Recording
-    from zfusion.swarm.launch import free_endpoints
+    from zfusion.swarm.ports import free_endpoints
 
     [endpoint] = free_endpoints(1)
     with Recording.open(simulated) as recording:

@@ -22,7 +22,7 @@ from zfusion.drivers.clocks import Clock
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.status import Phase, Status
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 MS = 1_000_000
 SECOND = 1_000_000_000

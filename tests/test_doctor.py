@@ -46,7 +46,7 @@ from zfusion.doctor.scenario import check_scenario
 from zfusion.doctor.versions import check_versions
 from zfusion.drivers.simulated import simulate
 from zfusion.model.scenario import load_scenario
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 MS = 1_000_000
 NOBODY = 65_534

@@ -12,7 +12,7 @@ from zfusion.drivers.claims import PATIENCE_NS, Claims
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import VERSION, Reason, encode_any
 from zfusion.status import Phase, Status
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 NODES = (1, 2, 3, 4)
 PACED = {"timing": {"rate_hz": 20.0}}

@@ -16,7 +16,7 @@ from zfusion.drivers.clocks import Clock
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import POSTED, POSTED_BYTES, STRETCH_NS, Inbox, Letter, Posted, Wake
 from zfusion.drivers.transport import RECEIPT, open_session
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 SOON_NS = 20_000_000_000
 """Far later than anything here takes; a wait that lasts until then has not been ended."""

@@ -16,7 +16,7 @@ from zfusion.drivers.key_source import KeySource
 from zfusion.drivers.transport import open_session
 from zfusion.errors import MessageError
 from zfusion.messages import decode_reading
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 KEY = "lab/thermometer/1"
 

@@ -14,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from swarms import EXAMPLE, Result, estimates, launch, recorded, run_name, variant, zfusion
-from zfusion.swarm.launch import Child, latecomers
+from zfusion.swarm.child import Child, latecomers
 
 STEPS = 300
 NODES = ["1", "2", "3", "4"]
@@ -198,7 +198,7 @@ def test_ids_may_be_names(directory: Path) -> None:
 CROWD = """
 import os, sys
 os.getpid = lambda: 4711  # as if they began at the same place
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 print(*(endpoint for _ in range(10) for endpoint in free_endpoints(15)), flush=True)
 sys.stdin.read()
 """

@@ -34,7 +34,7 @@ from zfusion.messages import encode
 from zfusion.model.scenario import load_scenario
 from zfusion.stages import Message
 from zfusion.status import Phase, Status
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 NODES = (1, 2, 3, 4)
 

@@ -46,7 +46,7 @@ from zfusion.drivers.transport import open_session, publisher
 from zfusion.errors import InputError
 from zfusion.model.scenario import load_scenario
 from zfusion.report.swarm_table import seen_swarm
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 NODES = ("1", "2", "3", "4")
 

@@ -16,7 +16,7 @@ from test_credentials import authority, credentials
 from zfusion.drivers.credentials import Credentials
 from zfusion.drivers.probe import Prober, Route, trouble
 from zfusion.drivers.settings import base_settings
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 HERE = "127.0.0.1"
 

@@ -27,7 +27,7 @@ from zfusion.messages import MAX_MESSAGE_BYTES, read_stamp
 from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.recording import Recording, RecordingWriter
 from zfusion.stages import MEASUREMENT
-from zfusion.swarm.launch import free_endpoints
+from zfusion.swarm.ports import free_endpoints
 
 RUN = "r"
 

@@ -44,6 +44,11 @@ Loss = Annotated[
     float | None,
     typer.Option(help="Probability that a message is lost on a link.", min=0, max=1, show_default="the scenario's"),
 ]
+Record = Annotated[
+    Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
+]
+NoRecord = Annotated[bool, typer.Option("--no-record", help="Write no recording.")]
+Restart = Annotated[bool, typer.Option("--restart", help="Start a node that dies again.")]
 RunName = Annotated[str | None, typer.Option("--run", help="Name of the run.", show_default="made up")]
 Connect = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to dial; may be repeated.")]
 Listen = Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on; may be repeated.")]

@@ -20,7 +20,10 @@ from zfusion.cli.common import (
     Listen,
     Loss,
     MethodName,
+    NoRecord,
     Rate,
+    Record,
+    Restart,
     RunName,
     ScenarioFile,
     Seed,
@@ -48,7 +51,8 @@ from zfusion.model.scenario import Scenario, load_scenario
 from zfusion.model.types import NodeId
 
 if TYPE_CHECKING:
-    from zfusion.swarm.launch import Child, Launcher
+    from zfusion.swarm.child import Child
+    from zfusion.swarm.launch import Launcher
 
     WatchedBy = Callable[[Launcher, Mapping[NodeId, Child], Child | None], None]
 
@@ -64,11 +68,9 @@ def launch(
     method: MethodName = None,
     links: Links = None,
     loss: Loss = None,
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
-    ] = None,
-    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
-    restart: Annotated[bool, typer.Option("--restart", help="Start a node that dies again.")] = False,
+    record: Record = None,
+    no_record: NoRecord = False,
+    restart: Restart = False,
     netns: Annotated[bool, typer.Option("--netns", help="Every node in a network namespace of its own.")] = False,
     netns_with: Annotated[
         NetnsKind | None,
@@ -148,10 +150,8 @@ def simulate(
     method: MethodName = None,
     links: Links = None,
     loss: Loss = None,
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Recording to write.", show_default="recordings/<run>.mcap")
-    ] = None,
-    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
+    record: Record = None,
+    no_record: NoRecord = False,
     run: RunName = None,
     as_json: Json = False,
 ) -> None:

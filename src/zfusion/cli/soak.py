@@ -15,7 +15,9 @@ from zfusion.cli.common import (
     Json,
     Links,
     MethodName,
+    NoRecord,
     Rate,
+    Restart,
     RunName,
     ScenarioFile,
     Seed,
@@ -32,7 +34,8 @@ from zfusion.model.types import NodeId
 
 if TYPE_CHECKING:
     from zfusion.studies.soak.growth import Growth
-    from zfusion.swarm.launch import Child, Launcher
+    from zfusion.swarm.child import Child
+    from zfusion.swarm.launch import Launcher
     from zfusion.swarm.watch import Watch
 
 SAMPLES = "samples.csv"
@@ -83,8 +86,8 @@ def soak(
     record: Annotated[
         Path | None, typer.Option("--record", help="Recording to write.", show_default="<run>.mcap in the directory")
     ] = None,
-    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
-    restart: Annotated[bool, typer.Option("--restart", help="Start a node that dies again.")] = False,
+    no_record: NoRecord = False,
+    restart: Restart = False,
     run: RunName = None,
     as_json: Json = False,
 ) -> None:

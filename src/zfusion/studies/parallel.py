@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-from zfusion.swarm.launch import ONE_THREAD
+from zfusion.swarm.child import ONE_THREAD
 
 Item = TypeVar("Item")
 Done = TypeVar("Done")

@@ -5,31 +5,26 @@ Nothing is left running whatever happens: every child holds one end of a line an
 
 from __future__ import annotations
 
-import os
 import selectors
 import signal
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from itertools import chain, count
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.designs import with_design
-from zfusion.drivers.endpoints import dialled, links_of
+from zfusion.drivers.endpoints import links_of
 from zfusion.drivers.meeting import connected
 from zfusion.drivers.metrics import NodeReport, RecorderReport
-from zfusion.drivers.registry import Entry, registered
+from zfusion.drivers.registry import registered
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
-from zfusion.swarm.control import LauncherEnd
-from zfusion.swarm.netns.addresses import places
+from zfusion.swarm.child import Child, latecomers
+from zfusion.swarm.processes import processes
 from zfusion.swarm.standstill import STANDSTILL_S, Standstill, is_stopped
 
 STOP_S = 15.0
@@ -44,57 +39,8 @@ BLINK_S = 0.002
 MAX_RESTARTS = 10
 """Lives that `restart` gives a node beyond the first; one that keeps dying has a cause that more lives do not mend."""
 
-TAIL_LINES = 15
-"""Last lines of a failed process's log that are shown."""
-
-TAIL_BYTES = 65_536
-"""Bytes from the end of a log in which those lines are looked for: logs may be long."""
-
-PORTS = range(20_000, 32_000)
-"""Where free ports are looked for: below those that the system gives to whoever dials, who might get one of them
-between our finding it free and the node's listening on it."""
-
-BLOCK = 200
-"""Ports that one process at a time takes from."""
-
 DESIGN = "design.npz"
 """Among the logs: what all nodes share, where the method is designed off-line and the scenario names no file."""
-
-ZFUSION = (sys.executable, "-m", "zfusion")
-
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""A node's matrices are small: threads of a BLAS only get into each other's way, and the other nodes'."""
-
-
-@dataclass(slots=True)
-class Child:
-    """One process of the swarm."""
-
-    name: str
-    node: NodeId | None
-    """None for the recorder and the network."""
-    command: list[str]
-    log: Path
-    place: int = 0
-    """Its number among the namespaces, where there are any."""
-    process: subprocess.Popen[bytes] | None = None
-    line: LauncherEnd | None = None
-    status: Mapping[str, Any] = field(default_factory=dict)
-    health: Mapping[str, Any] = field(default_factory=dict)
-    """`drivers.health.health`, the last that it told."""
-    reports: list[Mapping[str, Any]] = field(default_factory=list)
-    told: bool = False
-    """Whether it has reported on its present life."""
-    error: str | None = None
-    exit_code: int | None = None
-    restarts: int = 0
-    blow: Mapping[str, Any] | None = None
-    """What has felled it by plan, as `misfortune.Blow`, until it is raised again."""
-
-    @property
-    def running(self) -> bool:
-        """Whether its process has been started and not been seen to end."""
-        return self.process is not None and self.exit_code is None
 
 
 @dataclass(slots=True)
@@ -154,15 +100,24 @@ class Launcher:
         """Nodes that came too late."""
         self._begun = False
         """Whether the swarm was seen to run."""
-        self._file = options.logs / "scenario.toml"
+        file = options.logs / "scenario.toml"
         try:
             options.logs.mkdir(parents=True, exist_ok=True)
             self._scenario = with_design(scenario, options.logs / DESIGN)
-            self._file.write_text(self._scenario.anchored().to_toml())
+            file.write_text(self._scenario.anchored().to_toml())
         except OSError as error:
             raise InputError(f"{options.logs}: cannot be written: {error.strerror}") from None
-        self._network = self._plan_network()
-        self._recorder, self._nodes = self._plan()
+        self._processes = processes(
+            self._scenario,
+            file,
+            run=options.run,
+            logs=options.logs,
+            recording=options.recording,
+            netns=options.netns,
+            health_s=options.health_s,
+        )
+        self._network, self._recorder = self._processes.network, self._processes.recorder
+        self._nodes = self._processes.nodes
 
     def run(self) -> RunResult:
         """Start all, watch until all nodes have ended, finish the recording.
@@ -172,17 +127,17 @@ class Launcher:
         began = time.monotonic()
         try:
             if self._network is None or self._has_come_up(self._network):
-                for child in self._everybody():
+                for child in self._processes.everybody:
                     if child is not self._network:
                         self._start(child)
-            with registered(self._entry()):
+            with registered(self._processes.entry()):
                 self._watch_nodes()
             self._kill(self._nodes.values())
             self._finish(self._recorder)
             self._finish(self._network)
             self._note_unrecorded()
         finally:
-            self._kill(self._everybody())
+            self._kill(self._processes.everybody)
             self._selector.close()
         return RunResult(
             run=self._options.run,
@@ -200,70 +155,6 @@ class Launcher:
         """Stop cleanly; called again, kill what has not stopped. For signal handlers: only leaves word."""
         self._interrupts += 1
 
-    def _plan(self) -> tuple[Child | None, dict[NodeId, Child]]:
-        scenario, options = self._scenario, self._options
-        transport, common = scenario.transport, ["--run", options.run]
-        listens, recorder_dials = self._endpoints()
-        self._dials, self._recorder_listens = recorder_dials, ""
-        nodes: dict[NodeId, Child] = {}
-        for place, i in enumerate(scenario.ids):
-            command = [*ZFUSION, "node", str(self._file), "--id", str(i), *common]
-            if self._network is not None or not transport.zenoh_config:
-                command += _each("--listen", dict.fromkeys((listens[i], recorder_dials[i])))
-                command += _each("--connect", dialled(scenario, i, listens))
-            if options.recording is not None:
-                command.append("--await-recorder")
-            if self._network is not None:
-                command.append("--no-emulation")
-            if options.health_s:
-                command += ["--health", str(options.health_s)]
-            nodes[i] = Child(f"node {i}", i, command, options.logs / f"node-{i}.log", place)
-        recorder = None
-        if options.recording is not None:
-            command = [*ZFUSION, "record", str(self._file), *common, "-o", str(options.recording)]
-            if self._network is not None or not transport.zenoh_config:
-                command += _each("--connect", [recorder_dials[i] for i in scenario.ids])
-                [self._recorder_listens] = free_endpoints(1)  # for observers: peers pass nothing on
-                command += ["--listen", self._recorder_listens]
-            recorder = Child("the recorder", None, command, options.logs / "recorder.log", len(scenario.ids))
-        return recorder, nodes
-
-    def _endpoints(self) -> tuple[Mapping[NodeId, str], Mapping[NodeId, str]]:
-        """Where every node is dialled by the others, and where by the recorder."""
-        ids = self._scenario.ids
-        if self._network is not None:
-            where = places(ids)
-            return {p.node: p.endpoint for p in where}, {p.node: p.recorder_dials for p in where}
-        listens = dict(zip(ids, free_endpoints(len(ids)), strict=True)) | self._scenario.transport.endpoints
-        return listens, listens
-
-    def _entry(self) -> Entry:
-        """What observers on this machine need in order to look at the run."""
-        transport, network = self._scenario.transport, self._network
-        own = None if network is not None else transport.zenoh_config
-        enter = network.status.get("enter", ()) if network is not None else ()
-        return Entry(
-            run=self._options.run,
-            scenario=self._scenario.name,
-            endpoints={str(i): endpoint for i, endpoint in self._dials.items()},
-            recorder=self._recorder_listens if self._recorder is not None else None,
-            low_latency=transport.preset == "lowlatency",
-            config=str(self._scenario.absolute(own)) if own else None,
-            enter=tuple(enter[len(self._scenario.ids)]) if enter else (),
-        )
-
-    def _plan_network(self) -> Child | None:
-        options = self._options
-        if options.netns is None:
-            return None
-        command = [*ZFUSION, "network", str(self._file), "--run", options.run]
-        if options.netns != "auto":
-            command += ["--kind", options.netns]
-        return Child("the network", None, command, options.logs / "network.log")
-
-    def _everybody(self) -> list[Child]:
-        return [child for child in (self._network, self._recorder, *self._nodes.values()) if child is not None]
-
     def _has_come_up(self, network: Child) -> bool:
         """Start the network and wait until the namespaces are there; False where it ends, or is to end, before."""
         self._start(network)
@@ -280,30 +171,10 @@ class Launcher:
         return network.running and not self._interrupts
 
     def _start(self, child: Child) -> None:
-        line = child.line = LauncherEnd()
-        number = line.child.fileno()
-        with child.log.open("ab") as log:
-            child.process = subprocess.Popen(
-                [*self._entrance(child), *child.command, "--control-fd", str(number)],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=[number],
-                start_new_session=True,  # Ctrl-C is the launcher's to handle
-                env={**os.environ, **ONE_THREAD},
-            )
-        line.child.close()
-        if child.node is not None:
-            _let_finish(child.process.pid)
-        child.exit_code, child.error, child.status, child.health, child.told = None, None, {}, {}, False
-        self._selector.register(line.socket, selectors.EVENT_READ, child)
-
-    def _entrance(self, child: Child) -> Sequence[str]:
-        """The words before its command that have it run in its namespace."""
-        if self._network is None or child is self._network:
-            return ()
-        words: Sequence[str] = self._network.status["enter"][child.place]
-        return words
+        entrance: Sequence[str] = ()
+        if self._network is not None and child is not self._network:
+            entrance = self._network.status["enter"][child.place]
+        self._selector.register(child.start(entrance).socket, selectors.EVENT_READ, child)
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
@@ -332,12 +203,12 @@ class Launcher:
 
     def _give_up_stopped(self) -> None:
         """End processes that somebody has stopped, where the run can only wait for them, and has for too long."""
-        awaited = self._nodes.values() if self._begun else self._everybody()
+        awaited = self._nodes.values() if self._begun else self._processes.everybody
         running = {c.name: c for c in awaited if c.running and c.blow is None}
         processes = {name: c.process.pid for name, c in running.items() if c.process is not None}
         for name in self._standstill.overdue(processes, begun=self._begun):
             self._failures.append(
-                f"{name} was stopped{_step(running[name])} and not set going within {STANDSTILL_S:g} s: killed"
+                f"{name} was stopped{running[name].at_step()} and not set going within {STANDSTILL_S:g} s: killed"
             )
             self._options.on_message(self._failures[-1])
             self._kill([running[name]])
@@ -348,7 +219,7 @@ class Launcher:
         self._clock.look()
         for key, _ in self._selector.select(self._raise_fallen()):
             self._listen(key.data)
-        for child in self._everybody():
+        for child in self._processes.everybody:
             if child.running and child.process is not None and child.process.poll() is not None:
                 self._on_end(child, child.process.returncode)
         if self._options.on_update is not None:
@@ -389,12 +260,10 @@ class Launcher:
         essential = child.node is None or not self._begun
         if essential and code == InputError.exit_code and child.error is not None:
             raise InputError(f"{child.name}: {child.error}")
-        self._note_cut_short(child)
-        message = f"{child.name} died{_step(child)}: {_cause(child, code)}"
+        child.note_cut_short()
+        message = f"{child.name} died{child.at_step()}: {child.cause(code)}"
         restarting = self._may_restart(child)
-        self._options.on_message(
-            f"{message}{'; starting it again' if restarting else ''}\n{self._tail(child)}".rstrip()
-        )
+        self._options.on_message(f"{message}{'; starting it again' if restarting else ''}\n{child.tail()}".rstrip())
         if restarting:
             child.restarts += 1
             self._start(child)
@@ -443,11 +312,6 @@ class Launcher:
         reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
         return 0 if reached or (not others and blow["kind"] == "stop") else TICK_S
 
-    def _note_cut_short(self, child: Child) -> None:
-        """What is known of a node's life that did not end by itself."""
-        if child.node is not None and child.status and not child.told:
-            child.reports.append(asdict(NodeReport.cut_short(child.node, child.status)))
-
     def _may_restart(self, child: Child) -> bool:
         return (
             self._options.restart
@@ -456,12 +320,6 @@ class Launcher:
             and self._stop_by is None
             and child.restarts < MAX_RESTARTS
         )
-
-    def _tail(self, child: Child) -> str:
-        with child.log.open("rb") as log:
-            log.seek(max(0, log.seek(0, os.SEEK_END) - TAIL_BYTES))
-            lines = log.read().decode(errors="replace").splitlines()[-TAIL_LINES:]
-        return "\n".join([f"  last lines of {child.log}:", *(f"    {line}" for line in lines)]) if lines else ""
 
     def _stop_nodes(self) -> None:
         self._stop_by = self._stop_by or time.monotonic() + STOP_S
@@ -509,84 +367,6 @@ class Launcher:
                 child.process.kill()
                 child.exit_code = child.process.wait()
                 self._listen(child)
-                self._note_cut_short(child)
+                child.note_cut_short()
                 self._selector.unregister(child.line.socket)
                 child.line.close()
-
-
-def latecomers(nodes: Collection[Child]) -> list[Child]:
-    """Of connected nodes, those that find nobody to join any more: all others have taken their steps and ended.
-
-    They were started again; or the machine was so busy that the others were through before these had begun. One that is
-    connected with nobody begins whenever it comes.
-    """
-    if len(nodes) == 1:
-        return []
-    running = [child for child in nodes if child.running]
-    again = all(child.restarts and child.status.get("phase") != "running" for child in running)
-    ended = len(running) < len(nodes) and all(child.status.get("phase") == "joining" for child in running)
-    return running if again or ended else []
-
-
-def free_endpoints(number: int) -> list[str]:
-    """Endpoints on the loopback interface that nobody listens on now. InputError if there are not so many."""
-    sockets: list[socket.socket] = []
-    try:
-        for _ in PORTS:
-            if len(sockets) == number:
-                break
-            sockets.append(socket.socket())
-            try:
-                sockets[-1].bind(("127.0.0.1", next(_ports)))
-            except OSError:
-                sockets.pop().close()
-        if len(sockets) < number:
-            raise InputError(f"there are not {number} free ports between {PORTS.start} and {PORTS.stop}")
-        return [f"tcp/127.0.0.1:{s.getsockname()[1]}" for s in sockets]
-    finally:
-        for s in sockets:
-            s.close()
-
-
-def _own_ports() -> Iterator[int]:
-    """Ports, without end, of blocks that no other process takes ports from meanwhile.
-
-    What is free for one launcher is free for another, too, until the node listens: both would give it away. So a
-    block is his who holds its first port; one that somebody else holds is passed over, after a port that is not free.
-    """
-    blocks = [PORTS[first : first + BLOCK] for first in range(0, len(PORTS), BLOCK)]
-    for n in count(os.getpid()):
-        mark, *ports = blocks[n % len(blocks)]
-        with socket.socket() as holder:
-            try:
-                holder.bind(("127.0.0.1", mark))
-            except OSError:
-                ports = [mark]
-            yield from ports
-
-
-_ports = _own_ports()
-
-
-def _let_finish(pid: int) -> None:
-    """Have a node not be interrupted by the others whenever they wake up, where there are more nodes than processors.
-
-    (Linux's SCHED_BATCH: a sixth less CPU for a step of the four-sensor example on two processors.)
-    """
-    if sys.platform == "linux":
-        with suppress(OSError):  # it is gone already, or we are not allowed to
-            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
-
-
-def _each(option: str, values: Collection[str]) -> list[str]:
-    return [word for value in values for word in (option, value)]
-
-
-def _step(child: Child) -> str:
-    return f" at step {child.status['step']}" if child.status.get("step") else ""
-
-
-def _cause(child: Child, code: int) -> str:
-    if child.error is not None:
-        return child.error
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

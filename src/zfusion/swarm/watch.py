@@ -22,7 +22,7 @@ from zfusion.drivers.health import COUNTERS, QUEUES
 from zfusion.drivers.metrics import Latencies
 from zfusion.errors import InputError
 from zfusion.model.types import NodeId
-from zfusion.swarm.launch import Child
+from zfusion.swarm.child import Child
 
 NODE, RECORDER, LAUNCHER = "node", "recorder", "launcher"
 """Kinds of processes."""
