@@ -17,9 +17,11 @@ from deployed import deployed, hosts_document, planned, process
 from swarms import EXAMPLE, zfusion
 from zfusion import keys
 from zfusion.deploy.access import Speech, access_control
+from zfusion.deploy.compose import write_compose
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
+from zfusion.deploy.systemd import write_units
 from zfusion.errors import InputError, ScenarioError
 from zfusion.model.scenario import load_scenario
 
@@ -58,6 +60,24 @@ def test_fields_are_checked(tmp_path: Path) -> None:
         "topolgy",
     ]
     assert "did you mean 'topology'?" in found[-1]
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "224.0.0.1", "ff02::1", "fe80::1%eth0", "1.2.3", "-x.org"])
+def test_an_address_is_one_machines(tmp_path: Path, address: str) -> None:
+    [found] = problems(tmp_path, f'[hosts.a]\naddress = "{address}"\nnodes = [1, 2, 3, 4]')
+    assert found.startswith("hosts.a.address: expected ")
+
+
+def test_names_are_the_same_in_capitals(tmp_path: Path) -> None:
+    placed = (("a", "Sensor.example", [1, 2]), ("b", "sensor.example", [3, 4]))
+    hosts = [f'[hosts.{name}]\naddress = "{address}"\nnodes = {nodes}' for name, address, nodes in placed]
+    [found] = problems(tmp_path, "\n".join(hosts))
+    assert found.startswith("hosts.b.port: expected ports that a at the same address does not use")
+
+
+def test_no_stop_is_planned_where_nobody_sets_going_again(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"scenario: faults\[0\]: expected no stop"):
+        planned(tmp_path, hosts_document(), faults=[{"kind": "stop", "node": 2, "step": 20, "steps": 5}])
 
 
 def test_placement_roles_and_ports_are_checked(tmp_path: Path) -> None:
@@ -238,6 +258,54 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
         write(Plan(plan.scenario, plan.hosts, "other"), out)
 
 
+def test_who_has_moved_leaves_nothing_behind(tmp_path: Path) -> None:
+    """Node 2 from a to b; the recorder and node 4 to d. What the user has put beside them stays."""
+    document, units = hosts_document(), (write_units, write_compose)
+    write(planned(tmp_path, document), out := tmp_path / "out", more=units)
+    (out / "b" / "recordings" / "field.mcap").write_bytes(b"precious")
+    (out / "a" / "tls" / "mine.pem").write_bytes(b"mine")
+    hosts = document["hosts"]
+    hosts["a"]["nodes"], hosts["b"] = [1], {**hosts["b"], "nodes": [2, 3], "recorder": False}
+    hosts["c"], hosts["d"] = {**hosts["c"], "nodes": []}, {"address": "127.0.0.9", "nodes": [4], "recorder": True}
+    plan = planned(tmp_path, document)
+    written = write(plan, out, more=units)
+    assert {"a/tls/node-2.key", "a/zenoh/node-2.json5", "b/tls/recorder.key", "c/compose.yaml"} <= set(written.removed)
+    for one in ("a", "b", "c", "d"):
+        mine = {Path(process.key).name for process in plan.on(one)}
+        assert {path.name for path in (out / one / "tls").glob("*.key")} == mine
+        assert {path.stem for path in (out / one / "zenoh").iterdir()} == {Path(key).stem for key in mine}
+    assert not (out / "c" / "systemd").exists()
+    assert "recorder" not in "".join(path.name for path in (out / "b" / "systemd").iterdir())
+    assert (out / "b" / "recordings" / "field.mcap").exists()
+    assert (out / "a" / "tls" / "mine.pem").exists()
+    assert write(plan, out, more=units).removed == []
+    fresh = tmp_path / "fresh"
+    write(plan, fresh, more=units)
+    ours = {name for name in contents(out) if name not in {"a/tls/mine.pem", "b/recordings/field.mcap"}}
+    assert ours == set(contents(fresh))
+    document["security"] = {"enabled": False}
+    write(planned(tmp_path, document), out, more=units)
+    assert [path.name for path in out.rglob("*.key")] == ["ca.key"]
+
+
+def test_a_ca_without_its_key_is_not_replaced(tmp_path: Path) -> None:
+    plan = deployed(tmp_path, hosts_document())
+    key = tmp_path / "out" / "ca" / "ca.key"
+    kept = key.rename(tmp_path / "kept.key")
+    before = contents(tmp_path / "out")
+    with pytest.raises(InputError, match=r"ca\.key: expected the key of ca\.pem, to sign with: put it back"):
+        write(plan, tmp_path / "out")
+    assert contents(tmp_path / "out") == before
+    kept.rename(key)
+    assert write(plan, tmp_path / "out").certificates_made == []
+
+
+def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/out: cannot be written: Not a directory"):
+        write(planned(tmp_path, hosts_document()), tmp_path / "file" / "out")
+
+
 def test_data_files_go_where_they_are_needed(tmp_path: Path) -> None:
     source = tmp_path / "source"
     for i in (1, 2, 3, 4):
@@ -302,12 +370,21 @@ def test_own_certificates_are_checked_and_copied(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"node-2.pem: it is the certificate of 'node-1'"):
         write(second, tmp_path / "third")
     (mine / "node-2.key").unlink()
-    with pytest.raises(InputError, match=r"node-2.key: cannot be read"):
+    (mine / "node-3.pem").unlink()
+    with pytest.raises(InputError, match=r"node-2.key: cannot be read") as caught:
         write(second, tmp_path / "third")
+    assert "node-3.pem: cannot be read" in str(caught.value)
+    assert not (tmp_path / "third" / "a").exists()
     own = {"ca": {"certificate": "out/ca/ca.pem", "key": "out/ca/ca.key"}}
     third = planned(tmp_path, {**hosts_document(), "security": own})
     write(third, tmp_path / "fourth")
     assert (tmp_path / "fourth/a/tls/ca.pem").read_bytes() == (mine / "ca.pem").read_bytes()
+    (tmp_path / "out/ca/ca.key").chmod(0o644)
+    with pytest.raises(InputError, match=r"ca\.key: everybody on this machine may read or change this key"):
+        write(third, tmp_path / "fifth")
+    leaf = {"ca": {"certificate": "mine/node-1.pem", "key": "mine/node-1.key"}}
+    with pytest.raises(InputError, match=r"node-1\.pem: it is no CA's certificate"):
+        write(planned(tmp_path, {**hosts_document(), "security": leaf}), tmp_path / "sixth")
 
 
 def test_the_commands(tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ def deploy(
             out.print(f"{output / name}")
         made, kept = len(written.certificates_made), len(written.certificates_kept)
         out.print(f"run {written.run}: {made} certificates made, {kept} kept")
+        for name in written.removed:
+            out.print(f"{output / name}: removed: its process is not on this host any more")
         for name in written.stale:
             out.print(f"{output / name}: no host of this deployment any more; left as it is")
 

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.types import CertificateIssuerPri
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from zfusion.drivers.credentials import keep_secret
 from zfusion.errors import InputError
 
 SKEW = timedelta(hours=1)
@@ -85,6 +86,7 @@ def read_authority(certificate: Path, key: Path) -> Authority:
         pem, secret = certificate.read_bytes(), key.read_bytes()
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read: {error.strerror}") from None
+    keep_secret(key)
     try:
         signer = load_pem_private_key(secret, password=None)
     except (ValueError, TypeError):
@@ -95,9 +97,18 @@ def read_authority(certificate: Path, key: Path) -> Authority:
         raise InputError(f"{certificate}: expected the CA's certificate in PEM") from None
     if issuer.public_key() != signer.public_key():
         raise InputError(f"{key}: it is not the key of {certificate}")
+    if not _is_authority(issuer):
+        raise InputError(f"{certificate}: it is no CA's certificate (basicConstraints: CA): it cannot sign others")
     if issuer.not_valid_after_utc <= datetime.now(UTC):
         raise InputError(f"{certificate}: this CA has expired: expected one that is valid")
     return Authority(issuer, signer, pem)  # type: ignore[arg-type]
+
+
+def _is_authority(certificate: x509.Certificate) -> bool:
+    try:
+        return bool(certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca)
+    except x509.ExtensionNotFound:
+        return False
 
 
 def _builder(

@@ -6,6 +6,7 @@ configuration, its certificate and its key.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import deepcopy
 from importlib.metadata import version
 from pathlib import Path
@@ -57,8 +58,8 @@ def compose(plan: Plan, host: str, *, data: bool = False) -> dict[str, Any]:
     return document | ({"secrets": {Path(file).name: {"file": f"./{file}"} for file in files}} if files else {})
 
 
-def write_compose(plan: Plan, directory: Path) -> None:
-    """Write the compose files of all hosts into their folders; InputError where the extra is missing."""
+def write_compose(plan: Plan, directory: Path) -> Iterator[Path]:
+    """Write the compose files of all hosts into their folders; the files. InputError where the extra is missing."""
     try:
         import yaml  # noqa: PLC0415 - of an extra
     except ImportError:
@@ -69,6 +70,7 @@ def write_compose(plan: Plan, directory: Path) -> None:
             header = HEADER.format(host=host, run=plan.run, version=version("zfusion"))
             text = yaml.safe_dump(document, sort_keys=False, width=120)
             (directory / host / FILE).write_text(f"{header}\n{text}")
+            yield directory / host / FILE
 
 
 def _service(plan: Plan, process: Process, data: bool) -> dict[str, Any]:

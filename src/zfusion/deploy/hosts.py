@@ -16,6 +16,7 @@ from zfusion.keys import NAME as RUN_NAME
 from zfusion.methods import chosen
 from zfusion.model.scenario import Scenario
 from zfusion.model.schema.base import Flag, Id, Spec
+from zfusion.model.schema.faults import StopFault
 from zfusion.model.types import NodeId
 from zfusion.stages import ARRIVALS, ESTIMATE, EVENT, REVISED, TRUTH
 
@@ -44,13 +45,29 @@ A_LIFE = 36_500
 """Days: a hundred years."""
 
 
+def _bind(value: str) -> str:
+    address = _as_ip(value)
+    if address is not None:
+        if "%" in value:
+            raise ValueError("expected an address without a zone: each machine has its own names for those")
+        return str(address)
+    if not HOST_NAME.fullmatch(value) or value.replace(".", "").isdecimal():
+        raise ValueError("expected an IP address, or a name like 'sensor-1.example.org'")
+    return value.lower()  # capitals make no other name
+
+
 def _address(value: str) -> str:
+    address = _as_ip(value)
+    if address is not None and (address.is_unspecified or address.is_multicast):
+        raise ValueError("expected the address of one machine, by which others reach it")
+    return _bind(value)
+
+
+def _as_ip(value: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        return str(ipaddress.ip_address(value))
+        return ipaddress.ip_address(value)
     except ValueError:
-        if not HOST_NAME.fullmatch(value) or value.replace(".", "").isdecimal():
-            raise ValueError("expected an IP address, or a name like 'sensor-1.example.org'") from None
-    return value
+        return None
 
 
 def _run(value: str) -> str:
@@ -60,6 +77,7 @@ def _run(value: str) -> str:
 
 
 Address = Annotated[str, Field(strict=True), AfterValidator(_address)]
+Bind = Annotated[str, Field(strict=True), AfterValidator(_bind)]
 Port = Annotated[int, Field(strict=True, ge=1, le=MAX_PORT)]
 Days = Annotated[int, Field(strict=True, ge=1, le=A_LIFE)]
 
@@ -72,7 +90,7 @@ class HostSpec(Spec):
 
     address: Address
     """By which the others reach it: an IP address, or a name that they can look up."""
-    bind: Address | None = None
+    bind: Bind | None = None
     """The address to listen at where that is another one: behind a NAT, in a container (``0.0.0.0``: at all)."""
     nodes: tuple[Id, ...] = ()
     recorder: Flag = False
@@ -159,9 +177,18 @@ def problems_of(hosts: HostsFile, scenario: Scenario) -> Iterator[Problem]:
     yield from _roles(hosts)
     yield from _ports(hosts)
     yield from _security(hosts.security, readable(scenario))
+    yield from _scenario(scenario)
+
+
+def _scenario(scenario: Scenario) -> Iterator[Problem]:
+    """What a scenario may have where there is a launcher only."""
     if scenario.transport.zenoh_config is not None:
         expected = "expected a scenario without transport.zenoh_config: the configurations are written here"
         yield Problem("scenario", scenario.transport.zenoh_config, expected)
+    for n, fault in enumerate(scenario.faults):
+        if isinstance(fault, StopFault):
+            expected = "expected no stop: there is no launcher on hosts that could set the node going again"
+            yield Problem(f"scenario: faults[{n}]", fault.kind, expected)
 
 
 def _placement(hosts: HostsFile, scenario: Scenario) -> Iterator[Problem]:

@@ -57,44 +57,64 @@ class Identities:
         """Whose certificates were good and stay."""
         self.made: list[str] = []
         """Who has got new ones."""
+        if self._security.certificates is not None:
+            self._prove_users_own()
         self._authority = None if self._security.certificates else self._given() or self._own()
 
-    def write(self, process: Process) -> None:
+    def write(self, process: Process) -> tuple[Path, Path, Path]:
         """See to it that a process has its files in its host's folder; InputError where its own are no good."""
         folder = self._directory / process.host
         private_directory(folder / "tls")
         address = self._plan.hosts.hosts[process.host].address
         credentials = credentials_of(folder, process)
         if self._authority is None:
-            self._copy(process, credentials, address)
-            return
-        if not self._renew and self._still_good(credentials, process, address):
+            self._copy(process, credentials)
+            self.made.append(f"{process.host}/{process.name}")
+        elif not self._renew and self._still_good(self._authority, credentials, process, address):
             self.kept.append(f"{process.host}/{process.name}")
-            return
-        credentials.authority.write_bytes(self._authority.pem)
-        certificate, key = self._authority.issue(process.name, address, self._security.days)
+        else:
+            self._issue(self._authority, credentials, process, address)
+            self.made.append(f"{process.host}/{process.name}")
+        return credentials.authority, credentials.certificate, credentials.key
+
+    def _issue(self, authority: Authority, credentials: Credentials, process: Process, address: str) -> None:
+        credentials.authority.write_bytes(authority.pem)
+        certificate, key = authority.issue(process.name, address, self._security.days)
         write_private(credentials.key, key)
         credentials.certificate.write_bytes(certificate)
         prove(credentials, common_name=process.name, address=address)
-        self.made.append(f"{process.host}/{process.name}")
 
-    def _still_good(self, credentials: Credentials, process: Process, address: str) -> bool:
-        assert self._authority is not None  # the caller has looked
+    @staticmethod
+    def _still_good(authority: Authority, credentials: Credentials, process: Process, address: str) -> bool:
         try:
             prove(credentials, common_name=process.name, address=address)
         except InputError:
             return False
-        return credentials.authority.read_bytes() == self._authority.pem
+        return credentials.authority.read_bytes() == authority.pem
 
-    def _copy(self, process: Process, credentials: Credentials, address: str) -> None:
-        """A user's own certificate, if it is good."""
+    def _users_own(self, process: Process) -> Credentials:
+        """The files that a user has for a process."""
         own = Path(str(self._security.certificates))
-        given = Credentials(own / "ca.pem", own / f"{process.name}.pem", own / f"{process.name}.key")
-        prove(given, common_name=process.name, address=address)
+        return Credentials(own / "ca.pem", own / f"{process.name}.pem", own / f"{process.name}.key")
+
+    def _prove_users_own(self) -> None:
+        """InputError with all that is wrong in a user's own certificates."""
+        wrong = []
+        for process in self._plan.processes:
+            try:
+                address = self._plan.hosts.hosts[process.host].address
+                prove(self._users_own(process), common_name=process.name, address=address)
+            except InputError as error:
+                wrong.append(str(error))
+        if wrong:
+            raise InputError("\n".join(dict.fromkeys(wrong)))
+
+    def _copy(self, process: Process, credentials: Credentials) -> None:
+        """A user's own certificate, which is good."""
+        given = self._users_own(process)
         credentials.authority.write_bytes(given.authority.read_bytes())
         write_private(credentials.key, given.key.read_bytes())
         credentials.certificate.write_bytes(given.certificate.read_bytes())
-        self.made.append(f"{process.host}/{process.name}")
 
     def _given(self) -> Authority | None:
         """A user's own CA."""
@@ -105,7 +125,12 @@ class Identities:
         """The CA of this deployment, made if it is not there yet."""
         folder = private_directory(self._directory / CA_FOLDER)
         files = folder / "ca.pem", folder / "ca.key"
-        if not all(file.exists() for file in files):
+        if files[0].exists() and not files[1].exists():
+            raise InputError(
+                f"{files[1]}: expected the key of {files[0].name}, to sign with: put it back while this runs; or take "
+                f"{folder} away, for a new CA, under which no certificate that was made so far is good any more"
+            )
+        if not files[0].exists():
             made = _authority_module().make_authority
             certificate, key = made(f"zfusion {self._plan.run}", max(CA_DAYS, 2 * self._security.days))
             write_private(files[1], key)

@@ -149,17 +149,17 @@ def units(plan: Plan, host: str) -> dict[str, str]:
     return {**services, target_of(plan): target, "zfusion.conf": USERS}
 
 
-def write_units(plan: Plan, directory: Path) -> None:
-    """Write the units of all hosts into their folders, and how to install them."""
+def write_units(plan: Plan, directory: Path) -> Iterator[Path]:
+    """Write the units of all hosts into their folders, and how to install them; the files."""
     for host in plan.hosts.hosts:
         files = units(plan, host)
         if not files:
             continue
         place = directory / host / DIRECTORY
         place.mkdir(exist_ok=True)
-        for name, text in files.items():
+        for name, text in {**files, "README": _install(plan, host)}.items():
             (place / name).write_text(text)
-        (place / "README").write_text(_install(plan, host))
+            yield place / name
 
 
 def unit_of(plan: Plan, process: Process) -> str:

@@ -79,13 +79,18 @@ def prove(credentials: Credentials, *, common_name: str | None = None, address: 
     """
     for file in (credentials.authority, credentials.certificate, credentials.key):
         _readable(file)
-    if credentials.key.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
-        raise InputError(f"{credentials.key}: everybody on this machine may read or change this key: chmod 600 it")
+    keep_secret(credentials.key)
     subject, ends = _shake_hands(credentials, address)
     if common_name is not None and subject != common_name:
         told = f"{credentials.certificate}: it is the certificate of {subject!r}, and this process is {common_name!r}"
         raise InputError(f"{told}: give it the Zenoh configuration that was made for it")
     return Proven(subject, ends)
+
+
+def keep_secret(key: Path) -> None:
+    """InputError where a key is no secret."""
+    if key.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
+        raise InputError(f"{key}: everybody on this machine may read or change this key: chmod 600 it")
 
 
 def _readable(file: Path) -> None:
