@@ -14,7 +14,7 @@ import zenoh
 
 from test_credentials import authority, credentials
 from zfusion.drivers.credentials import Credentials
-from zfusion.drivers.probe import Prober, Route, trouble
+from zfusion.drivers.probe import WORD_NS, Prober, Route, Waiting, trouble
 from zfusion.drivers.settings import base_settings
 from zfusion.swarm.ports import free_endpoints
 
@@ -75,3 +75,17 @@ def test_handshakes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert [record.message for record in caplog.records if "refused here" in record.message] == [
         f"{misplaced}: {wrong}"
     ]
+
+
+def test_who_is_waited_for_is_said_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
+    [free] = free_endpoints(1)
+    prober = Prober([Route(free)])
+    waiting = Waiting(prober, 1000)
+    for now in (999, 1000, 1001, 1000 + WORD_NS):
+        waiting.tell(now, lambda: ["node 1", "the recorder"], linked=True)
+    assert [record.message for record in caplog.records] == ["waiting for node 1, the recorder"] * 2
+    assert prober._thread is None
+    waiting.tell(1000 + 2 * WORD_NS, lambda: ["node 1"])
+    assert prober._thread is not None
+    prober._thread.join()
+    assert caplog.records[-1].message == f"{free}: the connection is refused: nothing listens there"

@@ -13,7 +13,7 @@ import msgpack
 import pytest
 import zenoh
 
-from swarms import EXAMPLE, wait_until
+from swarms import EXAMPLE, Command, run_name, variant, wait_until
 from test_flood import lies
 from zfusion import keys
 from zfusion.drivers import inbox as inbox_module
@@ -227,6 +227,20 @@ def test_by_itself_it_ends_when_everybody_has_come_and_gone(tmp_path: Path, scen
     studio.join()
     assert studio.report is not None
     assert studio.report.messages == 1 + len(scenario.ids)
+
+
+@pytest.mark.parametrize("when_full", ["wait", "drop"])
+def test_it_says_for_whom_it_waits_and_why(tmp_path: Path, when_full: str) -> None:
+    file = variant(tmp_path, recording={"when_full": when_full, "flush_interval_s": 3600.0})
+    run = run_name("waiting")
+    recorder = Command(tmp_path, "record", file, "--run", run, "-o", tmp_path / "w.mcap")
+    wait_until(lambda: "waiting for node 1, node 2, node 3, node 4" in recorder.said(), "it says for whom it waits")
+    wait_until(lambda: recorder.said().count("refused: nothing listens there") >= 4, "it says why")
+    node = Command(tmp_path, "node", file, "--run", run, "--id", 1)
+    wait_until(lambda: "waiting for node 2, node 3, node 4" in recorder.said(), "one has come")
+    for command in (node, recorder):
+        command.interrupt()
+        assert command.wait().code == 0
 
 
 def test_a_full_disk_ends_the_recording_and_the_recorder_goes_on_counting(studio: Studio) -> None:

@@ -24,7 +24,7 @@ from zfusion.drivers.clocks import ASK_AGAIN_NS, Clock
 from zfusion.drivers.endpoints import linked, links_of
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.meeting import POLL_NS, Meeting, Start, check_identity, connected, hops_from_smallest
-from zfusion.drivers.probe import Prober
+from zfusion.drivers.probe import WORD_NS, Prober, Waiting
 from zfusion.drivers.transport import never_linger, on_zenoh_thread
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Reason, decode_any, encode_any
@@ -41,9 +41,6 @@ ANSWER_S = 2.0
 
 LEAVE_NS = 5_000_000_000
 """How long a node stays after its last step for neighbours that do not confirm that they have its messages."""
-
-WORD_NS = 5_000_000_000
-"""How often a node that waits for others says for whom."""
 
 QUESTIONS = frozenset({"status?", "history?"})
 """Notices of queries. Each must be dropped explicitly, answered or not: Python would drop it holding its global lock,
@@ -134,7 +131,7 @@ class Presence:
         InputError where somebody runs something else, or has a clock that is too far off.
         """
         next_poll = self._now()
-        next_word = next_poll + WORD_NS
+        waiting = Waiting(self._prober, next_poll + WORD_NS)
         line = self._clock.line_ns
         while not self._host.stopping:
             try:
@@ -143,7 +140,7 @@ class Presence:
                 if moved := self._clock.line_ns - line:
                     line += moved
                     next_poll += moved
-                    next_word += moved
+                    waiting.due_ns += moved
                     self.meeting.moved_ns += moved
                 start = self._try_to_begin(now)
             except InputError:
@@ -160,11 +157,7 @@ class Presence:
                 for j in self.meeting.present:
                     self._ask_status(j)
                 self._host.tell_status()
-            if now >= next_word:
-                next_word = now + WORD_NS
-                log.warning("waiting for %s", ", ".join(self.meeting.missing()))
-                if not self.meeting.linked <= self.meeting.present:
-                    self._prober.look()
+            waiting.tell(now, self.meeting.missing, linked=self.meeting.linked <= self.meeting.present)
             self._inbox.rest(next_poll)
         return None
 

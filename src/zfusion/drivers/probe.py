@@ -12,12 +12,15 @@ import re
 import socket
 import ssl
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from zfusion.drivers.credentials import Credentials, common_name_of, reason_of
 
 log = logging.getLogger(__name__)
+
+WORD_NS = 5_000_000_000
+"""How often who waits for others says for whom."""
 
 PATIENCE_S = 2.0
 """How long a connection may take that is only to show why there is none."""
@@ -97,3 +100,21 @@ class Prober:
             why = trouble(route)
             if why is not None:
                 log.warning("%s: %s", route.endpoint, why)
+
+
+class Waiting:
+    """Says, now and then, for whom this process waits, and has the reason looked for."""
+
+    def __init__(self, prober: Prober, due_ns: int) -> None:
+        """`due_ns` is when it is said for the first time, on the caller's clock."""
+        self.due_ns = due_ns
+        self._prober = prober
+
+    def tell(self, now_ns: int, missing: Callable[[], Sequence[str]], *, linked: bool = False) -> None:
+        """Say who is `missing`, if it is time to; where all are `linked`, no link is looked into."""
+        if now_ns < self.due_ns:
+            return
+        self.due_ns = now_ns + WORD_NS
+        log.warning("waiting for %s", ", ".join(missing()))
+        if not linked:
+            self._prober.look()

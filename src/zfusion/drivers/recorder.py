@@ -26,7 +26,8 @@ from zfusion.drivers.credentials import RECORDER_NAME
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inbox import Inbox
 from zfusion.drivers.metrics import RecorderReport
-from zfusion.drivers.transport import closing, never_linger, on_zenoh_thread, open_session
+from zfusion.drivers.probe import WORD_NS, Waiting
+from zfusion.drivers.transport import closing, never_linger, on_zenoh_thread, open_session, prober
 from zfusion.errors import MessageError, RecordingError, RunError
 from zfusion.gaps import Gaps
 from zfusion.messages import MAX_MESSAGE_BYTES, Decoder, decode_any
@@ -107,6 +108,7 @@ class Recorder:
         self._clock = Clock()
         self._clock.keep()
         self._inbox = Inbox(self._session, self._clock)
+        self._waiting = Waiting(prober(endpoints, scenario.zenoh_config), self._clock.now() + WORD_NS)
         writer.accounts.is_legal = self.is_legal
         writer.accounts.is_topic = self._topics.__contains__
 
@@ -156,12 +158,13 @@ class Recorder:
         inbox = self._inbox
         next_flush = self._clock.now() + self._flush_ns
         while True:
+            wakes = next_flush if self._all_seen else min(next_flush, self._waiting.due_ns)
             if self._waits:
-                sample = inbox.wait_sample(CHANNEL, next_flush)
+                sample = inbox.wait_sample(CHANNEL, wakes)
                 if sample is not None:
                     self._receive(str(sample.key_expr), sample.payload, self._clock.now())
             elif not self._take():
-                inbox.rest(next_flush, or_posted=True)
+                inbox.rest(wakes, or_posted=True)
             now = self._clock.now()
             if now >= next_flush:
                 next_flush = now + self._flush_ns
@@ -171,6 +174,8 @@ class Recorder:
                     self._tell(self._count())
             if inbox.notices:
                 self._handle_notices()
+            if not self._all_seen:
+                self._waiting.tell(now, self._missing)
             if self._stopping or self._everybody_left(now):
                 self._drain()
                 return
@@ -271,12 +276,21 @@ class Recorder:
         with query:  # queries are to be dropped explicitly, see `presence.QUESTIONS`
             query.reply(keys.recorder_status_key(self._run), status.encode())
 
+    @property
+    def _all_seen(self) -> bool:
+        """Whether every node has been there."""
+        return len(self._seen) == len(self._ids)
+
+    def _missing(self) -> list[str]:
+        """The nodes that have not been there yet, in words."""
+        return [f"node {i}" for i in self._scenario.ids if str(i) not in self._seen]
+
     def _everybody_left(self, now: int) -> bool:
         """Whether all nodes have come and gone: with a word, or for good.
 
         Behind a router they may only be out of sight with it.
         """
-        if not self._until_all_gone or self._present or self._seen != self._ids:
+        if not self._until_all_gone or self._present or not self._all_seen:
             self._empty_since = 0
             return False
         out_of_sight = self._routed and not self._session.info.routers_zid()

@@ -35,7 +35,7 @@ import zenoh
 
 from zfusion.drivers.credentials import RENEW, Credentials, prove
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.probe import Prober, Route
+from zfusion.drivers.probe import Prober, Route, Waiting
 from zfusion.drivers.settings import base_settings
 from zfusion.errors import InputError
 
@@ -59,9 +59,6 @@ UNREACHED = "Unable to connect to any of"
 
 AGAIN_S = 0.25
 """How soon a client tries its routers again."""
-
-WORD_S = 5.0
-"""How often it is said that one is waited for."""
 
 RECEIPT = zenoh.TimestampInstrumentationBuilder().set_receive(True).build()
 """Has the receiving session stamp a message when it comes: 5 to 10 µs of work at each end."""
@@ -157,17 +154,14 @@ def _config(
 
 def _opened(config: zenoh.Config) -> zenoh.Session:
     """A session; a client's when one of its routers is there, which Zenoh does not wait for."""
-    next_word = time.monotonic()
+    waiting = Waiting(_prober(config), time.monotonic_ns())
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
             if _setting(config, "mode") != "client" or UNREACHED not in str(error):
                 raise
-        if time.monotonic() >= next_word:
-            next_word = time.monotonic() + WORD_S
-            log.warning("waiting for a router")
-            _prober(config).look()
+        waiting.tell(time.monotonic_ns(), lambda: ["a router"])
         time.sleep(AGAIN_S)
 
 
