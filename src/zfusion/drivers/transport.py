@@ -15,7 +15,7 @@ import socket
 import stat
 import struct
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -82,8 +82,9 @@ def open_session(
     try:
         return _opened(config)
     except zenoh.ZError as error:
-        where = f"listen {_listed(endpoints.listen)}, connect {_listed(endpoints.connect)}"
-        raise InputError(f"Zenoh session ({where}): {_reason(error)}") from None
+        where = ", ".join(f"{end} {', '.join(_endpoints(config, end)) or 'nothing'}" for end in ("listen", "connect"))
+        by = "" if config_file is None else f" by {config_file}"
+        raise InputError(f"Zenoh session{by} ({where}): {_reason(error)}") from None
 
 
 def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
@@ -170,14 +171,19 @@ def _setting(config: zenoh.Config, path: str) -> Any:
 
 
 def _prober(config: zenoh.Config) -> Prober:
-    dialled = _setting(config, "connect/endpoints")
-    if isinstance(dialled, dict):  # by the mode of the session
-        dialled = dialled.get(_setting(config, "mode"), [])
     credentials = Credentials.of(_setting(config, "transport/link/tls"))
     subjects = _setting(config, "access_control/subjects") or []
     names = frozenset(name for subject in subjects for name in subject.get("cert_common_names") or ())
     connecting = credentials[-1] if credentials else None
-    return Prober([Route(endpoint, connecting, names) for endpoint in dialled if isinstance(endpoint, str)])
+    return Prober([Route(endpoint, connecting, names) for endpoint in _endpoints(config, "connect")])
+
+
+def _endpoints(config: zenoh.Config, end: str) -> list[str]:
+    """Where a session of this configuration will "listen", or whom it will "connect" to."""
+    endpoints = _setting(config, f"{end}/endpoints")
+    if isinstance(endpoints, dict):  # by the mode of the session
+        endpoints = endpoints.get(_setting(config, "mode") or "peer", [])
+    return [endpoint for endpoint in endpoints if isinstance(endpoint, str)]
 
 
 def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zenoh.Config:
@@ -202,10 +208,6 @@ def _prove(config: zenoh.Config, name: str | None) -> None:
         left = proven.ends - datetime.now(UTC)
         if left < SOON:
             log.warning("%s expires in %d days: %s", credentials.certificate, left.days, RENEW)
-
-
-def _listed(endpoints: Sequence[str]) -> str:
-    return ", ".join(endpoints) or "nothing"
 
 
 def _reason(error: Exception) -> str:
