@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from zfusion.deploy.authority import Authority, make_authority, read_authority
 from zfusion.deploy.identity import write_private
-from zfusion.drivers.credentials import Credentials, prove
+from zfusion.drivers.credentials import Credentials, dialled_at, dialled_under, prove
 from zfusion.errors import InputError
 
 
@@ -121,3 +121,9 @@ def test_both_ends_of_a_configuration_are_looked_at(tmp_path: Path) -> None:
     tls["connect_private_key"] = "b.key"
     assert [files.certificate.name for files in Credentials.of(tls)] == ["a.pem", "b.pem"]
     assert Credentials.of({}) == []
+
+
+def test_where_a_process_is_dialled_is_read_from_metadata_that_may_be_anything() -> None:
+    assert dialled_at(dialled_under("10.0.0.1")) == "10.0.0.1"
+    for other in (None, "Penny Lane", [], {"location": "Penny Lane"}, {"zfusion": "x"}, {"zfusion": {"dialled_at": 1}}):
+        assert dialled_at(other) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import tomllib
 from pathlib import Path
@@ -17,11 +18,15 @@ from deployed import deployed, hosts_document, planned, process
 from swarms import EXAMPLE, zfusion
 from zfusion import keys
 from zfusion.deploy.access import Speech, access_control
+from zfusion.deploy.authority import read_authority
 from zfusion.deploy.compose import write_compose
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
-from zfusion.deploy.plan import Plan
+from zfusion.deploy.identity import write_private
+from zfusion.deploy.plan import Plan, Process
 from zfusion.deploy.systemd import write_units
+from zfusion.drivers.endpoints import Endpoints
+from zfusion.drivers.transport import open_session
 from zfusion.errors import InputError, ScenarioError
 from zfusion.model.scenario import load_scenario
 
@@ -403,6 +408,47 @@ def test_the_commands(tmp_path: Path) -> None:
     impostor = zfusion(beta, "node", "scenario.toml", "--id", 4, "--zenoh-config", "zenoh/node-3.json5")
     assert impostor.code == 2
     assert "it is the certificate of 'node-3', and this process is 'node-4'" in impostor.error
+
+
+def moved_away(out: Path, one: Process) -> None:
+    """Give a process a certificate that is good at another host's address."""
+    certificate, key = read_authority(out / "ca/ca.pem", out / "ca/ca.key").issue(one.name, "127.0.0.99", 10)
+    (out / one.host / one.certificate).write_bytes(certificate)
+    write_private(out / one.host / one.key, key)
+
+
+@pytest.mark.parametrize(("topology", "name"), [("direct", "node-3"), ("router", "router-a")])
+@pytest.mark.parametrize("bind", [None, "0.0.0.0"])
+def test_a_certificate_of_another_address_ends_who_is_dialled_at_this(
+    tmp_path: Path, topology: str, name: str, bind: str | None
+) -> None:
+    """The address is the one by which the others come, wherever the process listens."""
+    document = hosts_document(topology)
+    for host in document["hosts"].values():
+        host.update({} if bind is None else {"bind": bind})
+    plan = deployed(tmp_path, document)
+    one = process(plan, name)
+    moved_away(tmp_path / "out", one)
+    refused = zfusion(tmp_path / "out" / one.host, *plan.command(one)[1:])
+    assert refused.code == 2
+    assert refused.error == f"error: tls/{name}.pem: it is of another address than this host's"
+
+
+def test_whom_nobody_dials_may_be_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = deployed(tmp_path, hosts_document())
+    one = process(plan, "observer")
+    moved_away(tmp_path / "out", one)
+    monkeypatch.chdir(tmp_path / "out" / one.host)
+    open_session(Endpoints(), config_file=Path(one.zenoh_file), name=one.name).close()  # type: ignore[no-untyped-call]
+
+
+def test_a_port_that_is_taken_is_named_with_the_file_that_wants_it(tmp_path: Path) -> None:
+    plan = deployed(tmp_path, hosts_document())
+    one = process(plan, "node-3")
+    with socket.create_server(("127.0.0.1", int(one.listen[0].rpartition(":")[2]))):
+        refused = zfusion(tmp_path / "out" / one.host, *plan.command(one)[1:])
+    assert refused.code == 2
+    assert f"{one.zenoh_file} (listen {one.listen[0]}, connect {', '.join(one.connect)}): " in refused.error
 
 
 def test_without_the_extra_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

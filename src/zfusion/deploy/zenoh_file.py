@@ -8,6 +8,7 @@ from typing import Any
 
 from zfusion.deploy.access import Speech, access_control
 from zfusion.deploy.plan import Plan, Process
+from zfusion.drivers.credentials import dialled_under
 from zfusion.drivers.settings import base_settings
 
 AUTHORITY = "tls/ca.pem"
@@ -24,6 +25,8 @@ def zenoh_file(plan: Plan, process: Process, speech: Speech) -> str:
             "transport/link/tls": tls(process),
             "access_control": access_control(plan, process, speech),
         }
+        if process.listen:
+            settings["metadata"] = dialled_under(plan.hosts.hosts[process.host].address)
     header = f"// {process.name} of the run {plan.run}, by zfusion deploy. To be used in the folder above."
     return f"{header}\n{json.dumps(_nested(settings), indent=2)}\n"
 

@@ -36,6 +36,22 @@ REASONS: Mapping[int, str] = {
 """OpenSSL's codes of what is wrong with a certificate, in words; those that are not here come in OpenSSL's."""
 
 
+def dialled_under(address: str) -> dict[str, Any]:
+    """What Zenoh's free ``metadata`` say of a process that others dial: by which address, as certificates have it.
+
+    The endpoints that it listens at do not tell: behind a NAT or in a container they are others.
+    """
+    return {"zfusion": {"dialled_at": address}}
+
+
+def dialled_at(metadata: Any) -> str | None:
+    """The address that `dialled_under` put there; None in a configuration that has none."""
+    match metadata:
+        case {"zfusion": {"dialled_at": str(address)}}:
+            return address
+    return None
+
+
 def node_name(node: NodeId) -> str:
     """The common name of a node's certificate."""
     return f"node-{node}"
@@ -53,13 +69,14 @@ class Credentials:
     @classmethod
     def of(cls, tls: Mapping[str, Any]) -> list[Credentials]:
         """Those of Zenoh's ``transport/link/tls``: to listen with, and to connect with; often the same."""
-        found = []
-        for end in ("listen", "connect"):
-            names = ("root_ca_certificate", f"{end}_certificate", f"{end}_private_key")
-            files = [tls.get(name) for name in names]
-            if all(isinstance(file, str) for file in files):
-                found.append(cls(*(Path(str(file)) for file in files)))
-        return list(dict.fromkeys(found))
+        found = (cls.at(tls, end) for end in ("listen", "connect"))
+        return list(dict.fromkeys(files for files in found if files is not None))
+
+    @classmethod
+    def at(cls, tls: Mapping[str, Any], end: str) -> Credentials | None:
+        """Those of one end of links, "listen" or "connect", if all of them are named."""
+        files = [tls.get(name) for name in ("root_ca_certificate", f"{end}_certificate", f"{end}_private_key")]
+        return cls(*(Path(str(file)) for file in files)) if all(isinstance(file, str) for file in files) else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ os.environ.setdefault(
 
 import zenoh
 
-from zfusion.drivers.credentials import RENEW, Credentials, prove
+from zfusion.drivers.credentials import RENEW, Credentials, dialled_at, prove
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.probe import Prober, Route, Waiting
 from zfusion.drivers.settings import base_settings
@@ -203,8 +203,10 @@ def _base_config(config_file: Path | None, mode: str, low_latency: bool) -> zeno
 def _prove(config: zenoh.Config, name: str | None) -> None:
     """See that the certificates of a configuration are good, before Zenoh waits with them for ever."""
     by_names = _setting(config, "access_control/enabled")
-    for credentials in Credentials.of(_setting(config, "transport/link/tls")):
-        proven = prove(credentials, common_name=name if by_names else None)
+    tls = _setting(config, "transport/link/tls")
+    for credentials in Credentials.of(tls):
+        address = dialled_at(_setting(config, "metadata")) if credentials == Credentials.at(tls, "listen") else None
+        proven = prove(credentials, common_name=name if by_names else None, address=address)
         left = proven.ends - datetime.now(UTC)
         if left < SOON:
             log.warning("%s expires in %d days: %s", credentials.certificate, left.days, RENEW)
