@@ -26,7 +26,7 @@ from zfusion.deploy.identity import write_private
 from zfusion.deploy.plan import Plan, Process
 from zfusion.deploy.systemd import write_units
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.transport import open_session
+from zfusion.drivers.transport import may_ask, open_session
 from zfusion.errors import InputError, ScenarioError
 from zfusion.model.scenario import load_scenario
 
@@ -202,6 +202,17 @@ def test_rules_agree_between_the_ends_of_every_link(tmp_path: Path) -> None:
         for (a, b), message in ((link, m) for link in links for m in ("put", "query", "reply", "liveliness_token")):
             assert allowed(rules[a], b, "egress", message) == allowed(rules[b], a, "ingress", message)
             assert allowed(rules[b], a, "egress", message) == allowed(rules[a], b, "ingress", message)
+
+
+def test_who_may_ask_is_read_from_a_configuration(tmp_path: Path) -> None:
+    file = Path(process(deployed(tmp_path, hosts_document(run="r")), "observer").zenoh_file)
+    assert may_ask(keys.status_key("r", 3), tmp_path / "out" / "c" / file)
+    assert not may_ask(keys.history_key("r", 3), tmp_path / "out" / "c" / file)
+    own = {"enabled": True, "default_permission": "allow"}
+    rule = {"id": "x", "messages": ["query"], "permission": "deny", "key_exprs": ["zfusion/*/node/3/**"]}
+    (tmp_path / "own.json5").write_text(json.dumps({"access_control": own | {"rules": [rule]}}))
+    assert [may_ask(keys.status_key("r", i), tmp_path / "own.json5") for i in (1, 3)] == [True, False]
+    assert may_ask(keys.history_key("r", 3), None)
 
 
 def test_a_users_program_may_only_publish_its_sensors_readings(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import signal
 import socket
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,8 +18,11 @@ from typing import Any
 import pytest
 import tomli_w
 
+from deployed import deployed as written
+from deployed import hosts_document, planned, process, swarm
 from swarms import EXAMPLE, ZFUSION, Command, recorded, run_name, variant, wait_until, zfusion
 from test_clock_watch import SECOND, Box, ended, three
+from zfusion import keys
 from zfusion.deploy.authority import read_authority
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
@@ -44,7 +48,9 @@ from zfusion.doctor.ports import check_ports, why_not
 from zfusion.doctor.running import check_running
 from zfusion.doctor.scenario import check_scenario
 from zfusion.doctor.versions import check_versions
+from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.simulated import simulate
+from zfusion.drivers.transport import on_zenoh_thread, open_session
 from zfusion.model.scenario import load_scenario
 from zfusion.swarm.ports import free_endpoints
 
@@ -384,6 +390,80 @@ def test_nodes_that_run_are_asked_for_their_scenario_and_clock(tmp_path: Path) -
     assert "node 1 runs scenario" in stranger.what
     assert "the same scenario" in stranger.remedy
     assert not list(check_running(Ground(scenario, run), [], None))  # nobody listens: nobody is asked
+
+
+def stand_still(node: Command) -> None:
+    """As by Ctrl-Z: its port stays open, and nobody answers there."""
+    node.process.send_signal(signal.SIGSTOP)
+    stat = Path(f"/proc/{node.process.pid}/stat")
+    wait_until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "it stands still")
+
+
+def test_a_node_that_stands_still_beside_others_is_an_error(tmp_path: Path) -> None:
+    file, run = three(tmp_path, nodes=2), run_name("still")
+    scenario = load_scenario(file)
+    endpoints = [scenario.endpoint(i) for i in scenario.ids]
+    nodes = [Command(tmp_path, "node", file, "--run", run, "--id", i, "--forever") for i in scenario.ids]
+    with ended(nodes):
+        wait_until(lambda: all("begins with step 1" in node.said() for node in nodes), "they run")
+        other = only(check_running(Ground(scenario, "other"), endpoints, None))
+        stand_still(nodes[1])
+        wrong, right = check_running(Ground(scenario, run), endpoints, None)
+    assert (wrong.severity, right.severity) == (Severity.ERROR, Severity.OK)
+    assert wrong.what == f"node 2 of run {run}: not seen, though somebody listens at {endpoints[1]}"
+    assert "stands still" in wrong.why
+    assert right.what.startswith("node 1: running, ")
+    assert other.severity is Severity.OK  # that the ports are taken is told elsewhere
+    assert other.what.startswith("no node of run other shows itself: ")
+
+
+def test_nodes_that_do_not_answer_or_not_legibly_are_errors() -> None:
+    scenario, [endpoint] = load_scenario(EXAMPLE), free_endpoints(1)
+    ground = Ground(scenario, "r")
+    with open_session(Endpoints(listen=(endpoint,))) as session:
+        tokens = [session.liveliness().declare_token(keys.node_token("r", i)) for i in (1, 3)]
+        key = keys.status_key("r", 3)
+
+        def babble(query: Any) -> None:
+            with query:
+                query.reply(key, b"babble")
+
+        queryable = session.declare_queryable(key, on_zenoh_thread(babble))
+        unread, silent = check_running(ground, [endpoint], None)
+        for declared in (*tokens, queryable):
+            declared.undeclare()
+        nobody = only(check_running(ground, [endpoint], None))
+    assert (unread.severity, silent.severity) == (Severity.ERROR, Severity.ERROR)
+    assert unread.what == "node 3: answered what this version does not know"
+    assert silent.what == "node 1: there, and does not answer"
+    assert nobody.severity is Severity.OK
+    assert nobody.what.startswith("no node of run r shows itself")
+
+
+def test_a_door_of_another_machine_behind_which_nobody_shows_himself_is_no_all_clear(tmp_path: Path) -> None:
+    plan = planned(tmp_path, hosts_document(security={"enabled": False}))
+    ground, door = Ground(plan.scenario, plan.run, plan, "a"), process(plan, "node-3").listen[0]
+    assert ground.doors[process(plan, "node-1").listen[0]] == 1
+    with open_session(Endpoints(listen=(door,))):
+        hidden = only(check_running(ground, [door], None))
+    assert hidden.severity is Severity.WARNING
+    assert hidden.what == f"node 3 of run {plan.run}: not seen, though somebody listens at {door}"
+    assert "--run" in hidden.remedy
+
+
+def test_who_may_not_be_asked_is_said_to_be_there(tmp_path: Path) -> None:
+    plan = written(tmp_path, hosts_document(security={"observer_reads": ["estimate"]}), steps=100_000)
+    desk = process(plan, "observer")
+    words = (tmp_path / "field.toml", "--hosts", tmp_path / "hosts.toml", "--host", desk.host, "--folder", "..")
+    with swarm(plan, tmp_path / "out") as running:
+        wait_until(running.steps_taken, "steps are taken")
+        stand_still(running.commands["node-2"])
+        found = zfusion(tmp_path / "out" / desk.host, "doctor", *words, "--zenoh-config", desk.zenoh_file, "--json")
+    unasked, hidden = (Finding(**f) for f in found.summary["findings"] if f["topic"] == "running")
+    assert (unasked.severity, hidden.severity) == (Severity.WARNING, Severity.ERROR)
+    assert unasked.what.startswith("node 1, node 3, node 4: there, and may not be asked by ")
+    assert "security.observer_reads" in unasked.remedy
+    assert hidden.what.startswith(f"node 2 of run {plan.run}: not seen")
 
 
 def test_the_command_ends_with_one_where_there_is_an_error_and_fits_on_a_screen(tmp_path: Path, taken: str) -> None:

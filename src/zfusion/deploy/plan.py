@@ -127,6 +127,12 @@ class Plan:
         return found
 
     @cached_property
+    def doors(self) -> Mapping[str, NodeId]:
+        """Where nodes are dialled, and which is there; routers' clients are dialled nowhere."""
+        direct = self.hosts.topology == "direct"
+        return {reached: i for i, (_, reached) in self._listens.items()} if direct else {}
+
+    @cached_property
     def _routers_at(self) -> Mapping[str, str]:
         """Where the router of each host that has one is dialled."""
         hosts = self.hosts.hosts.items()

@@ -113,6 +113,15 @@ class Ground:
             dials += listens.values() if self.records else ()
         return tuple(dict.fromkeys(endpoint for endpoint in dials if endpoint not in self.listens))
 
+    @cached_property
+    def doors(self) -> dict[str, NodeId]:
+        """Behind which of these endpoints there is a node, and which."""
+        if self.plan is None:
+            own = self.scenario.transport.zenoh_config is not None
+            return {} if own else {endpoint: i for i, endpoint in listens_at(self.scenario).items()}
+        here = {endpoint: one.node for one in self.processes for endpoint in one.listen if one.node is not None}
+        return {**self.plan.doors, **here}
+
     @property
     def recordings(self) -> Path:
         """The directory that the recording goes to."""

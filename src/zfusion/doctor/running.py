@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from zfusion.doctor.finding import Finding, Topic
@@ -13,6 +13,7 @@ from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.inquiry import Answer, Answers, ask
 from zfusion.drivers.meeting import check_identity
 from zfusion.errors import InputError
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.status import Phase, Status
 
 TOPIC = Topic("running")
@@ -37,16 +38,28 @@ def check_running(ground: Ground, reachable: Collection[str], limit_ns: int | No
     except InputError as error:
         yield TOPIC.warning(str(error), "nodes that run could not be asked", "correct what it names")
         return
-    yield from judge(ground, answers, clock, limit_ns)
+    yield from judge(ground, reachable, answers, clock, limit_ns)
 
 
-def judge(ground: Ground, answers: Answers, clock: Clock, limit_ns: int | None) -> Iterator[Finding]:
+def judge(
+    ground: Ground, reachable: Collection[str], answers: Answers, clock: Clock, limit_ns: int | None
+) -> Iterator[Finding]:
     """What the answers mean."""
     if answers.unread:
         why = "nodes of different versions refuse each other"
-        yield TOPIC.error(f"{answers.unread} nodes answer in a way that this version does not know", why, SAME)
-    if not answers.of:
-        yield TOPIC.ok(f"no node of run {ground.run} answers: it does not run yet, or has another name (--run)")
+        yield TOPIC.error(f"{_nodes(answers.unread)}: answered what this version does not know", why, SAME)
+    if answers.unasked:
+        why = "versions, scenarios and clocks of nodes that run are compared by asking them"
+        remedy = "status among security.observer_reads in the hosts file, and deploy again"
+        said = f"{_nodes(answers.unasked)}: there, and may not be asked by {ground.zenoh_config}"
+        yield TOPIC.warning(said, why, remedy)
+    if answers.silent:
+        yield TOPIC.error(f"{_nodes(answers.silent)}: there, and does not answer", STANDS, LOOK)
+    hidden = list(_hidden(ground, reachable, answers))
+    yield from hidden
+    if not hidden and not answers.present:
+        reasons = "it does not run yet, stands still, or has another name (--run)"
+        yield TOPIC.ok(f"no node of run {ground.run} shows itself: {reasons}")
     for node, answer in answers.of.items():
         status = answer.status
         own = Status(node, ground.scenario.fingerprint, Phase.JOINING, 0, 0, None, {})
@@ -57,6 +70,32 @@ def judge(ground: Ground, answers: Answers, clock: Clock, limit_ns: int | None) 
                 yield TOPIC.error(str(error), "such nodes refuse each other", SAME)
         yield from _clock(answer, clock, limit_ns)
 
+
+def _hidden(ground: Ground, reachable: Collection[str], answers: Answers) -> Iterator[Finding]:
+    """Nodes at whose endpoint somebody listens, and that do not show themselves.
+
+    Where none does, ports of this machine that are taken are told of as such already.
+    """
+    told = () if answers.present else ground.listens
+    doors = {ground.doors[endpoint]: endpoint for endpoint in reachable if endpoint in ground.doors.keys() - told}
+    hidden = {node: endpoint for node, endpoint in doors.items() if node not in answers.present}
+    if not hidden:
+        return
+    said = f"{_nodes(hidden)} of run {ground.run}: not seen, though somebody listens at {', '.join(hidden.values())}"
+    if answers.present:
+        yield TOPIC.error(said, STANDS, LOOK)
+        return
+    why = "what is there stands still, is of a run of another name, is no node, or does not let this process in"
+    yield TOPIC.warning(said, why, "--run where the run has another name; else look at the processes there")
+
+
+def _nodes(nodes: Iterable[NodeId]) -> str:
+    return ", ".join(f"node {node}" for node in sorted_ids(nodes))
+
+
+STANDS = "it stands still, or is cut off: those that hear it wait for it, or go on without what it measures"
+
+LOOK = "look at the process there, which may be something else, and at its log"
 
 SAME = "install the same version of zfusion, and the same scenario, everywhere"
 

@@ -13,10 +13,10 @@ import zenoh
 from zfusion import keys
 from zfusion.drivers.clocks import Clock
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.transport import open_session
+from zfusion.drivers.transport import closing, may_ask, open_session
 from zfusion.errors import MessageError
 from zfusion.messages import encode_any
-from zfusion.model.types import NodeId
+from zfusion.model.types import NodeId, sorted_ids
 from zfusion.status import Status
 
 ANSWER_S = 1.0
@@ -40,8 +40,17 @@ class Answers(NamedTuple):
     """What all of them did."""
 
     of: dict[NodeId, Answer]
-    unread: int
-    """Answers that could not be read: of another version of zfusion, or not of zfusion."""
+    unread: frozenset[NodeId]
+    """Who answered what could not be read: of another version of zfusion, or not of zfusion."""
+    unasked: frozenset[NodeId]
+    """Who showed itself, and may not be asked by the rules of the session's configuration."""
+    silent: frozenset[NodeId]
+    """Who showed itself, and did not answer."""
+
+    @property
+    def present(self) -> frozenset[NodeId]:
+        """Who showed itself."""
+        return self.unread | self.unasked | self.silent | self.of.keys()
 
 
 def ask(
@@ -49,9 +58,11 @@ def ask(
 ) -> Answers:
     """Ask those of the nodes that show themselves; InputError where no session can be opened."""
     found: dict[NodeId, Answer] = {}
-    unread = 0
-    with open_session(endpoints, config_file=config_file) as session:
-        for node in _present(session, run, nodes):
+    unread: set[NodeId] = set()
+    with closing(open_session(endpoints, config_file=config_file)) as session:
+        present = frozenset(_present(session, run, nodes))
+        asked = {node for node in present if may_ask(keys.status_key(run, node), config_file)}
+        for node in sorted_ids(asked):
             asked_ns = clock.now()
             replies = session.get(
                 keys.status_key(run, node),
@@ -66,8 +77,9 @@ def ask(
                 try:
                     found[node] = Answer(Status.decode(reply.ok.payload.to_bytes()), asked_ns, answered_ns)
                 except MessageError:
-                    unread += 1
-    return Answers(found, unread)
+                    unread.add(node)
+    silent = asked - found.keys() - unread
+    return Answers(found, frozenset(unread), present - asked, frozenset(silent))
 
 
 def _present(session: zenoh.Session, run: str, nodes: Collection[NodeId]) -> list[NodeId]:

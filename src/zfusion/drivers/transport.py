@@ -92,15 +92,29 @@ def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
     return _prober(_config(endpoints, config_file=config_file))
 
 
+def may_ask(key: str, config_file: Path | None) -> bool:
+    """Whether the rules in a session's configuration let it ask about a key; InputError where it is none."""
+    rules = _setting(_config(Endpoints(), config_file), "access_control")
+    if not rules["enabled"]:
+        return True
+    exceptions = {
+        rule["permission"]
+        for rule in rules["rules"] or ()
+        if "query" in rule["messages"] and "egress" in (rule["flows"] or ["egress"])
+        if any(zenoh.KeyExpr(about).includes(zenoh.KeyExpr(key)) for about in rule["key_exprs"])
+    }
+    return "allow" in exceptions if rules["default_permission"] == "deny" else "deny" not in exceptions
+
+
 @contextmanager
-def closing(session: zenoh.Session) -> Iterator[None]:
+def closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
     """Close a session in the end.
 
     One with a link to somebody who is cut off may not close within Zenoh's ten seconds. That is told, and no reason to
     lose what its process has to report: the link ends with the process.
     """
     try:
-        yield
+        yield session
     finally:
         try:
             session.close()  # type: ignore[no-untyped-call]
