@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -30,6 +31,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from swarms import (
     PATIENCE_S,
     Command,
+    endpoints,
     estimates,
     process_of,
     run_name,
@@ -39,13 +41,14 @@ from swarms import (
 )
 from zfusion.drivers import registry
 from zfusion.drivers.endpoints import Endpoints
-from zfusion.drivers.observer import Observer, find_swarm
+from zfusion.drivers.observer import Observer, SeenNode, Swarm, find_swarm
 from zfusion.drivers.settings import LEASE_MS
 from zfusion.drivers.simulated import simulate
 from zfusion.drivers.transport import open_session, publisher
 from zfusion.errors import InputError
 from zfusion.model.scenario import load_scenario
 from zfusion.report.swarm_table import seen_swarm
+from zfusion.status import Phase, Status
 from zfusion.swarm.ports import free_endpoints
 
 NODES = ("1", "2", "3", "4")
@@ -299,6 +302,52 @@ def test_a_registry_that_others_can_write_to_is_not_used(tmp_path: Path, monkeyp
 def test_nobody_is_there(directory: Path) -> None:
     [endpoint] = free_endpoints(1)
     assert "nobody is there" in zfusion(directory, "status", "--connect", endpoint).error
+
+
+@pytest.mark.parametrize("words", [("status",), ("top", "--once")])
+def test_nobody_of_a_run_is_there(run: str, directory: Path, words: tuple[str, ...]) -> None:
+    live = endpoints(directory / "observed.toml")["1"]
+    result = zfusion(directory, *words, "--connect", live, "--run", "another")
+    assert (result.code, result.out) == (1, "")
+    assert "nobody of run another is there" in result.error
+
+
+def test_what_is_no_endpoint_is_refused(directory: Path) -> None:
+    result = zfusion(directory, "status", "--connect", "garbage")
+    assert result.code == 2
+    assert "connect: expected Zenoh endpoints" in result.error
+    with pytest.raises(InputError, match="listen: expected Zenoh endpoints"):
+        open_session(Endpoints(listen=("garbage",)))
+
+
+def test_rates_of_a_single_look_are_those_of_the_whole_life(run: str, directory: Path) -> None:
+    command = Command(directory, "top", "--run", run, "--json")
+    wait_until(lambda: command.heard, "the first look")
+    command.interrupt()
+    nodes = json.loads(command.wait().out.splitlines()[0])["nodes"]
+    assert list(nodes) == list(NODES)
+    for node in nodes.values():
+        assert node["rate_hz"] == pytest.approx(node["completed"] / node["elapsed_s"], abs=1e-3)
+
+
+def test_paces_are_taken_over_no_less_than_a_second() -> None:
+    node, told = SeenNode(present=True), Status(1, "f", Phase.RUNNING, 0, 1, None, {})
+    rates = []
+    for at_s, completed in ((50.0, 100), (50.01, 100), (50.1, 103), (51.0, 120), (55.0, 200)):
+        node.answer(replace(told, completed=completed), at_s)
+        rates.append(node.rate_hz)
+    assert rates == [None, None, None, 20.0, 20.0]  # it tells nothing of its life here
+
+
+def test_a_look_ends_though_somebody_takes_the_connection_and_says_nothing() -> None:
+    """As a process that is stopped does; Zenoh, left to itself, waits for him for ten seconds."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        observer = Observer(Swarm("run", Endpoints(connect=(f"tcp/127.0.0.1:{silent.getsockname()[1]}",))))
+        silent.settimeout(PATIENCE_S)
+        with silent.accept()[0]:
+            begins = time.monotonic()
+            observer.close()
+    assert time.monotonic() - begins < 8.0
 
 
 def test_top_on_a_terminal_ends_with_q(run: str, directory: Path) -> None:

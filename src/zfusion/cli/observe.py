@@ -58,6 +58,7 @@ def status(
 
     with Observer(reachable(scenario, run, connect, zenoh_config)) as observer:
         observer.settle()
+        observer.expect_somebody()
         finish(seen_swarm(observer), as_json, lambda: out.print(swarm_table(observer, out.width)))
     if observer.missing:
         raise typer.Exit(1)
@@ -80,6 +81,7 @@ def top(
         observer.settle()
         show: Callable[[], Any] = lambda: swarm_table(observer, out.width, out.height)  # noqa: E731
         if once:
+            observer.expect_somebody()
             quitting.rest(interval)  # a rate needs two looks
         watch(observer.ask, lambda: seen_swarm(observer), show, quitting, interval, once, as_json)
     if once and observer.missing:

@@ -59,7 +59,7 @@ def ask(
     """Ask those of the nodes that show themselves; InputError where no session can be opened."""
     found: dict[NodeId, Answer] = {}
     unread: set[NodeId] = set()
-    with closing(open_session(endpoints, config_file=config_file)) as session:
+    with closing(open_session(endpoints, config_file=config_file, looks=True)) as session:
         present = frozenset(_present(session, run, nodes))
         asked = {node for node in present if may_ask(keys.status_key(run, node), config_file)}
         for node in sorted_ids(asked):

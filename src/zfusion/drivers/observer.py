@@ -26,7 +26,7 @@ from zfusion.drivers import registry
 from zfusion.drivers.credentials import OBSERVER_NAME
 from zfusion.drivers.endpoints import Endpoints, listens_at
 from zfusion.drivers.inbox import Wake
-from zfusion.drivers.transport import on_zenoh_thread, open_session
+from zfusion.drivers.transport import closing, on_zenoh_thread, open_session
 from zfusion.errors import InputError, MessageError, RunError
 from zfusion.messages import MAX_MESSAGE_BYTES, encode_any
 from zfusion.model.scenario import load_scenario
@@ -43,6 +43,9 @@ GLANCE_S = 0.05
 
 PACE_S = 10.0
 """Time over which a pace is taken: slow swarms make a step a second."""
+
+SHORTEST_PACE_S = 1.0
+"""Over less than that a pace is chance: a slow node makes no step meanwhile, and one that catches up makes many."""
 
 PACES = 64
 """Answers that are kept for that."""
@@ -151,13 +154,14 @@ class SeenNode:
 
     @property
     def rate_hz(self) -> float | None:
-        """Steps a second: between the answers of the last seconds, or, after one answer, over the node's life."""
+        """Steps a second: between the answers of the last seconds, or, where they say too little, over its life."""
         if self.status is None or not self.present:
             return None
         paces = [pace for pace in self._paces if pace[1] == self.status.born]
-        if len(paces) > 1:
+        if paces:
             (began, _, first), (ended, _, last) = paces[0], paces[-1]
-            return (last - first) / (ended - began)
+            if ended - began >= SHORTEST_PACE_S:
+                return (last - first) / (ended - began)
         counts = self.status.counts
         return self.status.completed / counts.elapsed_s if counts is not None and counts.elapsed_s > 0 else None
 
@@ -249,7 +253,7 @@ class Observer:
         self._news: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
         self._listening: list[Any] = []
         self._session = open_session(
-            swarm.endpoints, low_latency=swarm.low_latency, config_file=swarm.config, name=OBSERVER_NAME
+            swarm.endpoints, low_latency=swarm.low_latency, config_file=swarm.config, name=OBSERVER_NAME, looks=True
         )
         liveliness, hear = self._session.liveliness(), on_zenoh_thread(self._hear_token)
         run = swarm.run or "*"
@@ -268,14 +272,14 @@ class Observer:
 
     def close(self) -> None:
         """Look no more."""
-        for declared in (*self._listening, *self._tokens):
-            declared.undeclare()
-        self._session.close()  # type: ignore[no-untyped-call]
+        with closing(self._session):
+            for declared in (*self._listening, *self._tokens):
+                declared.undeclare()
 
     def settle(self, patience_s: float = SETTLE_S) -> None:
         """Wait until all that are expected are there, or none has come for a while, and ask them.
 
-        InputError where no run was named and several are there; RunError where nobody is.
+        InputError where no run was named and several are there; RunError where none was and nobody is.
         """
         end = time.monotonic() + patience_s
         while True:
@@ -288,8 +292,14 @@ class Observer:
                 break
             time.sleep(GLANCE_S)
         if self.run is None:
-            raise RunError(f"nobody is there: {self._where()}")
+            self.expect_somebody()
         self.ask()
+
+    def expect_somebody(self) -> None:
+        """RunError where nobody is there, and nobody is known who should be."""
+        if self.run is None or (not self.nodes and self.recorder is None):
+            of = "" if self.run is None else f" of run {self.run}"
+            raise RunError(f"nobody{of} is there: {self._where()}")
 
     def look(self) -> None:
         """Note who has come and gone. InputError where no run was named and there are several."""

@@ -21,6 +21,10 @@ MAX_RECEIVED = 16 << 20
 """Bytes of the largest message that a session puts together: what is larger is dropped piece by piece. Sixteen times
 what zfusion's messages may have: too large ones are to be counted, but not to fill the memory."""
 
+LOOK = {"transport/unicast/open_timeout": LEASE_MS}
+"""Of a session that only looks. Zenoh does not close one while it dials somebody who takes the connection and says
+nothing, as a process that is stopped does; by itself it waits ten seconds for him to speak."""
+
 LOW_LATENCY = {"transport/unicast/qos/enabled": False, "transport/unicast/lowlatency": True}
 """About a third off a round trip. Both ends must have it, messages of 48 KiB and more vanish, priorities do too."""
 

@@ -36,7 +36,7 @@ import zenoh
 from zfusion.drivers.credentials import RENEW, Credentials, dialled_at, prove
 from zfusion.drivers.endpoints import Endpoints
 from zfusion.drivers.probe import Prober, Route, Waiting
-from zfusion.drivers.settings import base_settings
+from zfusion.drivers.settings import LOOK, base_settings
 from zfusion.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -71,13 +71,17 @@ def open_session(
     config_file: Path | None = None,
     mode: str = "peer",
     name: str | None = None,
+    looks: bool = False,
 ) -> zenoh.Session:
     """An open Zenoh session; InputError, naming the endpoint or file, where Zenoh refuses it.
 
     A user's `config_file` comes first; the endpoints, where given, replace its own. Where it has certificates they are
-    proven first, as those of `name` where there are rules about names.
+    proven first, as those of `name` where there are rules about names. One that only `looks` has no time for those who
+    say nothing.
     """
     config = _config(endpoints, config_file, mode, low_latency)
+    for path, value in LOOK.items() if looks else ():
+        config.insert_json5(path, json.dumps(value))
     _prove(config, name)
     try:
         return _opened(config)
@@ -160,10 +164,13 @@ def _config(
     endpoints: Endpoints, config_file: Path | None = None, mode: str = "peer", low_latency: bool = False
 ) -> zenoh.Config:
     config = _base_config(config_file, mode, low_latency)
-    if endpoints.listen:
-        config.insert_json5("listen/endpoints", json.dumps(list(endpoints.listen)))
-    if endpoints.connect:
-        config.insert_json5("connect/endpoints", json.dumps(list(endpoints.connect)))
+    for what, given in (("listen", endpoints.listen), ("connect", endpoints.connect)):
+        if given:
+            try:
+                config.insert_json5(f"{what}/endpoints", json.dumps(list(given)))
+            except zenoh.ZError:
+                expected = "expected Zenoh endpoints, like tcp/10.0.0.1:7450"
+                raise InputError(f"{what}: {expected} (is {_listed(given)})") from None
     return config
 
 
