@@ -28,6 +28,7 @@ import tomli_w
 from opentelemetry.proto.collector.metrics.v1.metrics_service_pb2 import ExportMetricsServiceRequest
 from prometheus_client.parser import text_string_to_metric_families
 
+from deployed import deployed, hosts_document, swarm
 from swarms import (
     PATIENCE_S,
     Command,
@@ -348,6 +349,29 @@ def test_a_look_ends_though_somebody_takes_the_connection_and_says_nothing() -> 
             begins = time.monotonic()
             observer.close()
     assert time.monotonic() - begins < 8.0
+
+
+def test_an_observer_of_a_secured_run_is_told_what_it_lacks_and_gets_what_it_is_given(directory: Path) -> None:
+    plan = deployed(directory, hosts_document(), steps=1_000_000, timing={"rate_hz": 20.0})
+    with swarm(plan, directory / "out") as running:
+        wait_until(running.steps_taken, "messages are on the recording")
+        beside = zfusion(directory / "out" / "a", "status", "--run", plan.run)  # the nodes' configurations are here
+        desk, given = directory / "out" / "c", ("--zenoh-config", "zenoh/observer.json5", "--run", plan.run)
+        found = zfusion(desk, "status", *given, "--json")
+        lines = zfusion(desk, "echo", "**", *given, "--json", "--count", 40).out.splitlines()
+        denied = zfusion(desk, "echo", "1/measurement", *given)
+        running.interrupt()
+        running.ended()
+    assert beside.code == 2
+    assert "an observer's (zfusion deploy writes it as zenoh/observer.json5)" in beside.error
+    assert [node["state"] for node in found.summary["nodes"].values()] == ["running"] * 4
+    letters = [json.loads(line) for line in lines]
+    estimates_of = [(m["message"]["node"], m["message"]["step"]) for m in letters if m["key"].endswith("/estimate")]
+    assert {m["key"].rpartition("/")[2] for m in letters} <= {"estimate", "event"}
+    assert {str(node) for node, _ in estimates_of} == set(NODES)
+    assert len(set(estimates_of)) == len(estimates_of)  # nothing comes twice
+    assert denied.code == 2
+    assert "(security.observer_reads) give nothing of" in denied.error
 
 
 def test_top_on_a_terminal_ends_with_q(run: str, directory: Path) -> None:

@@ -231,7 +231,7 @@ def node(
         on_signals(live.stop)
         if control is not None:
             control.on_stop(live.stop)
-        with noted(control, loaded, options.run, options.endpoints.listen, own):
+        with noted(control, loaded, options.run, options.endpoints.listen, own, own_config=zenoh_config is not None):
             report = asdict(live.run())
     if control is not None:
         control.tell(report=report)
@@ -285,7 +285,7 @@ def record(
         on_signals(recorder.stop)
         if control is not None:
             control.on_stop(recorder.stop)
-        with noted(control, loaded, name, endpoints.listen):
+        with noted(control, loaded, name, endpoints.listen, own_config=zenoh_config is not None):
             report = asdict(recorder.run())
     if control is not None:
         control.tell(report=report)
@@ -297,9 +297,18 @@ def record(
 
 
 def noted(
-    control: Any, scenario: Scenario, run: str, listens: Sequence[str], node: NodeId | None = None
+    control: Any,
+    scenario: Scenario,
+    run: str,
+    listens: Sequence[str],
+    node: NodeId | None = None,
+    *,
+    own_config: bool,
 ) -> AbstractContextManager[None]:
-    """Have observers on this machine find a process that was started by hand: a node, or the recorder."""
+    """Have observers on this machine find a process that was started by hand: a node, or the recorder.
+
+    `own_config` says that the Zenoh configuration is this process' alone, not the scenario's.
+    """
     from zfusion.drivers.endpoints import listens_at
     from zfusion.drivers.registry import Entry, registered
 
@@ -315,7 +324,8 @@ def noted(
         elsewhere={} if own else {str(i): endpoint for i, endpoint in listens_at(scenario).items()},
         recorder=listens[0] if node is None and listens else None,
         low_latency=transport.preset == "lowlatency",
-        config=str(scenario.absolute(own)) if own else None,
+        config=str(scenario.absolute(own)) if own and not own_config else None,
+        own_configs=bool(own) and own_config,
     )
     return registered(entry)
 

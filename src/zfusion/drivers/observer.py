@@ -26,7 +26,7 @@ from zfusion.drivers import registry
 from zfusion.drivers.credentials import OBSERVER_NAME
 from zfusion.drivers.endpoints import Endpoints, listens_at
 from zfusion.drivers.inbox import Wake
-from zfusion.drivers.transport import closing, on_zenoh_thread, open_session
+from zfusion.drivers.transport import closing, on_zenoh_thread, open_session, subscribable
 from zfusion.errors import InputError, MessageError, RunError
 from zfusion.messages import MAX_MESSAGE_BYTES, encode_any
 from zfusion.model.scenario import load_scenario
@@ -113,6 +113,11 @@ def find_swarm(
 
 
 def _noted(entry: registry.Entry) -> Swarm:
+    if entry.own_configs:
+        raise InputError(
+            f"run {entry.run}: each of its processes has a Zenoh configuration of its own: give --zenoh-config FILE, "
+            f"an observer's (zfusion deploy writes it as zenoh/observer.json5), and --run {entry.run}"
+        )
     nodes = {**entry.elsewhere, **entry.endpoints}
     dialled = filter(None, [*nodes.values(), entry.recorder])
     return Swarm(
@@ -339,14 +344,32 @@ class Observer:
                     self.strangers += 1
 
     def listen(self, key: str) -> Ring:
-        """Have what is published on a key expression come into a ring. InputError for what is none."""
+        """Have what is published on a key expression, as far as it is given to this session, come into a ring.
+
+        InputError for what is no key expression, and where rules give nothing of it.
+        """
         ring = Ring()
         try:
-            subscriber = self._session.declare_subscriber(key, on_zenoh_thread(ring.post))
+            wanted = zenoh.KeyExpr(key)
         except zenoh.ZError as error:
             raise InputError(f"KEY: expected a Zenoh key expression (is {key!r}): {error}".split(" at /")[0]) from None
-        self._listening.append(subscriber)
+        for given in self._given_of(wanted):
+            self._listening.append(self._session.declare_subscriber(given, on_zenoh_thread(ring.post)))
         return ring
+
+    def _given_of(self, wanted: zenoh.KeyExpr) -> list[zenoh.KeyExpr]:
+        """What to subscribe to: Zenoh drops, without a word, a subscription to more than its rules allow."""
+        rules = None if self._swarm.config is None else subscribable(self._swarm.config)
+        if rules is None:
+            return [wanted]
+        given = widest(map(zenoh.KeyExpr, rules))
+        if any(allowed.includes(wanted) for allowed in given):
+            return [wanted]
+        within = widest(allowed for allowed in map(zenoh.KeyExpr, rules) if wanted.includes(allowed))
+        if not within:
+            said = f"{self._swarm.config}: its rules (security.observer_reads) give nothing of {wanted}"
+            raise InputError(f"{said}, but of {', '.join(map(str, given)) or 'nothing at all'}")
+        return within
 
     @property
     def missing(self) -> list[str]:
@@ -416,6 +439,12 @@ class Observer:
         if self._swarm.config is not None:
             return str(self._swarm.config)
         return ", ".join(self._swarm.endpoints.connect)
+
+
+def widest(expressions: Iterable[zenoh.KeyExpr]) -> list[zenoh.KeyExpr]:
+    """Those that no other one of them includes."""
+    found = list(expressions)
+    return [one for one in found if not any(other != one and other.includes(one) for other in found)]
 
 
 def order(name: str) -> tuple[bool, int, str]:

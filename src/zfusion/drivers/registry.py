@@ -40,7 +40,9 @@ class Entry:
     """Where the recorder is dialled; None where there is none, or none that listens."""
     low_latency: bool = False
     config: str | None = None
-    """The user's Zenoh configuration."""
+    """The user's Zenoh configuration, which is everybody's."""
+    own_configs: bool = False
+    """Whether each process has one of its own instead, as zfusion deploy makes them: none is an observer's."""
     enter: tuple[str, ...] = ()
     """The words before a command that have it run where the nodes can be reached, if that is not everywhere."""
     pid: int = field(default_factory=os.getpid)
@@ -80,6 +82,7 @@ def entries() -> list[Entry]:
             endpoints={**first.endpoints, **entry.endpoints},
             elsewhere={**first.elsewhere, **entry.elsewhere},
             recorder=first.recorder or entry.recorder,
+            own_configs=first.own_configs or entry.own_configs,
         )
     return list(found.values())
 

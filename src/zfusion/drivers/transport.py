@@ -57,6 +57,9 @@ SOON = timedelta(days=14)
 UNREACHED = "Unable to connect to any of"
 """What Zenoh says when a client reaches none of its routers."""
 
+FLOWS = ("ingress", "egress")
+"""The ways that a rule of Zenoh's is about where it does not say which."""
+
 AGAIN_S = 0.25
 """How soon a client tries its routers again."""
 
@@ -139,6 +142,18 @@ def never_linger() -> None:
                 with socket.socket(fileno=os.dup(number)) as link:
                     if link.type == socket.SOCK_STREAM and link.family in {socket.AF_INET, socket.AF_INET6}:
                         link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+
+
+def subscribable(config_file: Path) -> list[str] | None:
+    """The key expressions that the rules of a configuration let its process subscribe to; None without such rules."""
+    rules = _setting(_base_config(config_file, "peer", low_latency=False), "access_control")
+    if not rules["enabled"] or rules["default_permission"] != "deny":
+        return None
+    allowed = (rule for rule in rules["rules"] or () if rule["permission"] == "allow")
+    reads = (
+        rule for rule in allowed if "declare_subscriber" in rule["messages"] and "egress" in (rule["flows"] or FLOWS)
+    )
+    return sorted({key for rule in reads for key in rule["key_exprs"]})
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
