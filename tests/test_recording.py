@@ -179,6 +179,19 @@ def test_a_file_that_cannot_be_made_and_one_that_cannot_be_written(tmp_path: Pat
         open_writer(Path("/dev/full"))
 
 
+def test_a_file_that_is_being_written_is_refused_to_others_and_left_as_it_is(tmp_path: Path) -> None:
+    path, sent = tmp_path / "r.mcap", traffic(20)
+    with open_writer(path) as writer:
+        for message in sent:
+            writer.write(*message)
+        with pytest.raises(RecordingError, match=r"r\.mcap: cannot be written: another process is writing it"):
+            open_writer(path)
+        with Recording.open(path) as recording:  # reading is for everybody
+            assert not recording.complete
+    assert read(path) == sent
+    assert read(record(path, sent[:3])) == sent[:3], "and for the next one when it is done"
+
+
 def test_a_disk_that_fills_up_costs_what_came_after(tmp_path: Path) -> None:
     """A limit on the size of files stands for the disk: in a process of its own, as it cannot be lifted again."""
     path = tmp_path / "r.mcap"

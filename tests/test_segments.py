@@ -88,6 +88,21 @@ def test_only_so_many_files_are_kept(tmp_path: Path) -> None:
         assert "begins with segment" in recording.note
 
 
+@pytest.mark.parametrize("max_files", [0, 1], ids=["all are kept", "only the last is kept"])
+def test_a_recording_that_goes_on_in_another_file_is_still_refused_to_others(tmp_path: Path, max_files: int) -> None:
+    path, sent = tmp_path / "r.mcap", traffic(200)
+    with open_writer(path, keeping=Keeping(rotate_bytes=20_000, max_files=max_files)) as writer:
+        for message in sent:
+            writer.write(*message)
+        assert path not in writer.files[-1:]
+        before = {file: file.read_bytes() for file in segments(path)}
+        with pytest.raises(RecordingError, match=r"r\.mcap: cannot be written: another process is writing it"):
+            open_writer(path)
+        assert {file: file.read_bytes() for file in segments(path)} == before
+    found = read(path)
+    assert found == sent[-len(found) :]
+
+
 def test_a_segment_that_is_missing_damaged_or_of_another_recording_is_told(tmp_path: Path) -> None:
     sent = traffic(200)
     path = record(tmp_path / "r.mcap", sent, keeping=SMALL)

@@ -230,6 +230,26 @@ def refused(directory: Path, *words: object, run: str | None = None) -> str:
     return result.error
 
 
+def test_a_second_recorder_of_a_file_is_refused_and_the_first_has_everything(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, **PACED) as running:
+        running.wait_for(2, 10)
+        errors = [
+            refused(tmp_path, "launch", EXAMPLE, "--record", running.recording),
+            refused(tmp_path, "record", EXAMPLE, "-o", running.recording),
+            refused(tmp_path, "simulate", EXAMPLE, "--record", running.recording),
+        ]
+        running.wait_for(2, running.step(2) + 10)
+        running.command.interrupt()
+        result = running.command.wait()
+    assert all(
+        error.endswith(f"{running.recording}: cannot be written: another process is writing it") for error in errors
+    )
+    assert result.code == 0, result.err
+    assert result.summary["messages"]["sent"] == result.summary["messages"]["recorded"]
+    with Recording.open(running.recording) as recording:
+        assert recording.complete
+
+
 def test_a_port_that_is_in_use_fails_the_launch(tmp_path: Path) -> None:
     scenario = variant(tmp_path)
     host, port = endpoints(scenario)["3"].removeprefix("tcp/").split(":")

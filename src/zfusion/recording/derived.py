@@ -81,8 +81,9 @@ class DerivedWriter:
         names = json.dumps([path.name for path in sources])
         derived = {"kind": kind, "sources": names, "note": note, "account": json.dumps(account)}
         end = dict(closing or {"messages": str(self.messages)}) | {layout.IN_SEGMENT: str(self.messages)}
-        self._segment.finish({layout.DERIVED: derived, layout.STATISTICS: to_state(statistics), layout.CLOSE: end})
-        os.replace(self._segment.path, self.path)
+        with self._segment.claimed():
+            self._segment.finish({layout.DERIVED: derived, layout.STATISTICS: to_state(statistics), layout.CLOSE: end})
+            os.replace(self._segment.path, self.path)
 
     def __enter__(self) -> Self:
         try:

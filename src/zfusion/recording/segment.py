@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from zfusion.recording import layout
 from zfusion.recording.channels import Describe, Description, Table, to_metadata
+from zfusion.recording.claim import open_claimed
 
 CHUNK_BYTES = 1 << 20
 """Messages are compressed in blocks of this size: 4 % smaller files than blocks of 64 KiB, 5 ms to close one."""
@@ -65,8 +67,8 @@ class SegmentWriter:
         self._writer: Writer
 
     def open(self) -> None:
-        """Make the file; one that is there is replaced."""
-        self._file = self.path.open("wb")
+        """Make the file; one that is there is replaced, unless another process is writing it: OSError."""
+        self._file = open_claimed(self.path)
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=self._compression, enable_data_crcs=True)
 
     def begin(self) -> None:
@@ -118,6 +120,15 @@ class SegmentWriter:
         self._measure()
         self._tell_channels()
         self._there.flush()
+
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Have it be nobody else's to write until the end of the block, though it is closed within."""
+        also = os.dup(self.fileno())
+        try:
+            yield
+        finally:
+            os.close(also)
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         """Write metadata records, each sealed, and the indexes; close the file."""

@@ -7,6 +7,7 @@ that gets too large, or too long, goes on in another file (`layout`).
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -19,6 +20,7 @@ from zfusion.gaps import Gaps
 from zfusion.recording import layout
 from zfusion.recording.accounts import Accounts, to_state
 from zfusion.recording.channels import by_stages
+from zfusion.recording.claim import TAKEN, is_claimed
 from zfusion.recording.keeping import Keeping, Syncer
 from zfusion.recording.provenance import clocks, machine, software
 from zfusion.recording.segment import STRIDE_BYTES, SegmentWriter
@@ -28,12 +30,12 @@ from zfusion.stages import Stage
 class RecordingWriter:
     """An open recording. A context manager: leaving it finishes the file.
 
-    `path` must be in a directory that is there; a file there is replaced. `stages` are those of the method beside the
-    built-in ones, for the schemas on the file; topics of other stages are recorded all the same. `design` is what the
-    file of the method's design holds. `facts` are what else the caller knows of the run and wants on the file;
-    `keeping` says when files are changed and when to stop. RecordingError if the file cannot be made, or there is no
-    room for it; RunError from any method when writing fails (disk full): the file is closed then, and readable up to
-    there.
+    `path` must be in a directory that is there; a file there is replaced, unless another process is writing it.
+    `stages` are those of the method beside the built-in ones, for the schemas on the file; topics of other stages are
+    recorded all the same. `design` is what the file of the method's design holds. `facts` are what else the caller
+    knows of the run and wants on the file; `keeping` says when files are changed and when to stop. RecordingError if
+    the file cannot be made, is written by another process, or there is no room for it; RunError from any method when
+    writing fails (disk full): the file is closed then, and readable up to there.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class RecordingWriter:
             raise RecordingError(f"{self.path}: cannot be written: {self.stopped}")
         self._segment = self._following(start)
         try:
+            self._look_for_others()
             self._segment.open()
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
@@ -184,6 +187,11 @@ class RecordingWriter:
                 if free < least:
                     self.stopped = f"only {free} bytes are free on the disk, and min_free_bytes is {least}"
 
+    def _look_for_others(self) -> None:
+        """OSError if a recording that began at the same place is being written, though in another file by now."""
+        if any(map(is_claimed, layout.following_paths(self.path))):
+            raise OSError(errno.EBUSY, TAKEN)
+
     def _following(self, start: dict[str, str]) -> SegmentWriter:
         """The file of the present number."""
         place = {layout.SEGMENT: str(self._number)}
@@ -201,11 +209,12 @@ class RecordingWriter:
 
     def _rotate(self) -> None:
         following = layout.segment_path(self.path, self._number + 1)
-        self._close({layout.NEXT: following.name})
-        self._number += 1
-        self._rotate_at_ns = None
-        self._segment = self._following(clocks())
-        self._segment.open()
+        with self._segment.claimed():  # the recording is ours at any moment
+            self._close({layout.NEXT: following.name})
+            self._number += 1
+            self._rotate_at_ns = None
+            self._segment = self._following(clocks())
+            self._segment.open()
         self._segment.begin()
         self._watch()
         self._kept.append(following)
