@@ -14,7 +14,9 @@ import pytest
 from mcap.reader import make_reader
 
 from swarms import EXAMPLE, Result, estimates, launch, recorded, run_name, variant, zfusion
-from zfusion.swarm.child import Child, latecomers
+from zfusion.model.scenario import load_scenario
+from zfusion.swarm.child import Child, bereft, latecomers
+from zfusion.swarm.launch import Launcher, LaunchOptions
 
 STEPS = 300
 NODES = ["1", "2", "3", "4"]
@@ -218,16 +220,18 @@ def test_launchers_that_look_for_free_ports_at_the_same_time_find_different_ones
     assert not {*found[0]} & {*found[1]}
 
 
-def test_who_finds_nobody_to_join_any_more_is_not_waited_for() -> None:
-    def child(number: int, phase: str, *, ended: bool = False, restarts: int = 0) -> Child:
-        made = Child(f"node {number}", number, [], Path())
-        made.process = subprocess.Popen(["true"])
-        made.process.wait()
-        made.exit_code = 0 if ended else None
-        made.status, made.restarts = {"phase": phase}, restarts
-        return made
+def child(number: int, phase: str, *, exit_code: int | None = None, restarts: int = 0) -> Child:
+    """A process of which its launcher knows that."""
+    made = Child(f"node {number}", number, [], Path())
+    made.process = subprocess.Popen(["true"])
+    made.process.wait()
+    made.note_status({"phase": phase, "epoch_ns": 1 if restarts or phase != "joining" else None})
+    made.exit_code, made.restarts = exit_code, restarts
+    return made
 
-    through, late = child(1, "done", ended=True), child(2, "joining")
+
+def test_who_finds_nobody_to_join_any_more_is_not_waited_for() -> None:
+    through, late = child(1, "done", exit_code=0), child(2, "joining")
     assert latecomers([through, late]) == [late]
     assert latecomers([child(1, "joining"), late]) == []  # they wait for each other
     assert latecomers([late]) == []  # it waits for nobody
@@ -235,3 +239,33 @@ def test_who_finds_nobody_to_join_any_more_is_not_waited_for() -> None:
     assert latecomers([through, late, child(3, "done")]) == []  # which stays for whom it has not told all
     again = child(3, "joining", restarts=1)
     assert latecomers([through, again]) == [again]
+    assert bereft([through, again]) == []
+    assert latecomers([child(1, "running", exit_code=-9), late]) == [late]
+
+
+def test_those_that_all_died_have_nobody_to_join_and_are_not_too_late() -> None:
+    all_again = [child(number, "joining", restarts=1) for number in (1, 2, 3)]
+    assert bereft(all_again) == all_again
+    assert latecomers(all_again) == []
+    dead = child(4, "running", exit_code=-9, restarts=10)
+    assert bereft([*all_again, dead]) == all_again  # one that does not come back is not waited for
+    for other in (child(4, "joining"), child(4, "running"), child(4, "running", restarts=1), child(4, "done")):
+        assert bereft([*all_again, other]) == []  # who will begin, or can be joined
+    assert bereft(all_again[:1]) == []  # it waits for nobody
+    unbegun = [child(number, "joining") for number in (1, 2)]
+    for node in unbegun:
+        node.restarts = 1
+    assert bereft(unbegun) == []  # they meet as they would have at first
+
+
+def test_who_had_not_begun_when_the_swarm_was_stopped_has_not_failed(tmp_path: Path) -> None:
+    options = LaunchOptions(run_name("stopped"), tmp_path / "logs", None)
+    for stopped in (False, True):
+        launcher = Launcher(load_scenario(EXAMPLE), options)
+        through = {number: child(number, "done", exit_code=0) for number in (1, 3, 4)}
+        launcher._nodes = through | {2: child(2, "joining")}
+        if stopped:
+            launcher._stop_nodes()
+        launcher._help_who_finds_nobody()
+        late = [] if stopped else ["node 2 had not begun when all others had ended"]
+        assert launcher._failures == late

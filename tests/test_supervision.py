@@ -204,6 +204,42 @@ def test_a_node_that_dies_is_started_again_and_taken_back_in(tmp_path: Path, pac
     assert verdict.code == 0, verdict.out + verdict.err
 
 
+def kill_all_at_once(running: Swarm) -> None:
+    pids = [process_of(running.run, "--id", node) for node in NODES]
+    for how in (signal.SIGSTOP, signal.SIGKILL):  # none is to go on, and be joined, while the others are killed
+        for pid in pids:
+            os.kill(pid, how)
+
+
+def test_nodes_that_all_die_at_once_go_on_together(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, "--restart", **PACED) as running:
+        running.wait_for(2, 20)
+        kill_all_at_once(running)
+        for node, used in {1: [1, 2, 3], 2: [2, 3, 4], 3: [1, 3, 4], 4: [1, 2, 4]}.items():
+            wait_until(
+                lambda n=node, u=used: running.last(n)["born"] > 20 and running.last(n)["used"] == u,
+                f"node {node} uses {used} again, not {running.last(node)}\n{running.command.said()}",
+            )
+        running.command.interrupt()
+        result = running.command.wait()
+    assert result.code == 0, result.err
+    assert result.summary["restarts"] == 4
+    assert result.summary["failures"] == []
+    verdict = zfusion(tmp_path, "replay", running.recording, "--verify", "--json")
+    assert verdict.code == 0, verdict.out + verdict.err
+    assert verdict.summary["different"] == 0
+
+
+def test_a_run_without_times_has_failed_when_all_its_nodes_die_at_once(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, "--restart", "--free-run") as running:
+        running.wait_for(2, 20)
+        kill_all_at_once(running)
+        result = running.command.wait()
+    assert result.code == 1, result.err
+    words = "found nobody to join: all had died at about the same time"
+    assert sorted(result.summary["failures"]) == [f"node {node} {words}" for node in NODES]
+
+
 def test_the_death_of_the_recorder_ends_the_run_and_costs_one_flush_at_most(tmp_path: Path) -> None:
     with swarm(tmp_path, "--steps", ENDLESS, recording={"flush_interval_s": 0.2}, **PACED) as running:
         running.wait_for(3, 75)

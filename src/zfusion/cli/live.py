@@ -230,7 +230,7 @@ def node(
         logs.about(options.run, own, lambda: None if live.node is None else live.node.step)
         on_signals(live.stop)
         if control is not None:
-            control.on_stop(live.stop)
+            control.on_stop(live.stop, lambda told: live.keep_to(told["epoch_ns"]))
         with noted(control, loaded, options.run, options.endpoints.listen, own, own_config=zenoh_config is not None):
             report = asdict(live.run())
     if control is not None:

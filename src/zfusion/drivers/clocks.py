@@ -111,6 +111,10 @@ class Clock:
         """A reading of the machine's clock, on the line."""
         return wall_ns - self._set_ns + self.ahead_ns
 
+    def on_machine(self, line_ns: int) -> int:
+        """A time on the line, as the machine's clock has it now."""
+        return line_ns + self._set_ns - self.ahead_ns
+
     def look(self) -> Jump | None:
         """See what the machine's clock has done since the last look: follow where it was slewed, tell where it jumped.
 

@@ -177,6 +177,12 @@ class LiveNode:
         self.stopping = True
         self._inbox.notify(None)
 
+    def keep_to(self, epoch_ns: int) -> None:
+        """Begin in the midst of a run whose step 0 was at `epoch_ns`, if it has not begun; from any thread."""
+        if self.phase is Phase.JOINING:
+            self._meeting.keep_to(epoch_ns)
+            self._inbox.notify(None)
+
     def status(self, *, counted: bool = False) -> Status:
         """How the node is doing; what it has `counted` where that is wanted."""
         node, meeting = self.node, self._meeting

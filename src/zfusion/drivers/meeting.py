@@ -86,6 +86,11 @@ class Meeting:
         if status.epoch_ns is not None and not self.fixed_epoch:
             self.epoch_ns = status.epoch_ns
 
+    def keep_to(self, epoch_ns: int) -> None:
+        """The epoch is given: begin with the step that is next by then, with whoever is there."""
+        self.fixed_epoch = True
+        self.epoch_ns = epoch_ns
+
     def missing(self) -> list[str]:
         """Who or what this node still waits for, in words."""
         absent = [f"node {j}" for j in sorted(self.linked - self.present, key=str)]

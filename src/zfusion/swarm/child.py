@@ -40,6 +40,8 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     line: LauncherEnd | None = None
     status: Mapping[str, Any] = field(default_factory=dict)
+    epoch_ns: int | None = None
+    """When step 0 was, as it said first; None as long as it has not."""
     health: Mapping[str, Any] = field(default_factory=dict)
     """`drivers.health.health`, the last that it told."""
     reports: list[Mapping[str, Any]] = field(default_factory=list)
@@ -48,6 +50,8 @@ class Child:
     error: str | None = None
     exit_code: int | None = None
     restarts: int = 0
+    resumes: bool = False
+    """Whether it was told to begin in the midst of the run."""
     blow: Mapping[str, Any] | None = None
     """What has felled it by plan, as `misfortune.Blow`, until it is raised again."""
 
@@ -74,7 +78,14 @@ class Child:
         if self.node is not None:
             _let_finish(self.process.pid)
         self.exit_code, self.error, self.status, self.health, self.told = None, None, {}, {}, False
+        self.resumes = False
         return line
+
+    def note_status(self, status: Mapping[str, Any]) -> None:
+        """It has told how it is doing."""
+        self.status = status
+        if self.epoch_ns is None:
+            self.epoch_ns = status.get("epoch_ns")
 
     def note_cut_short(self) -> None:
         """Take for a report what is known of a node's life that did not end by itself."""
@@ -105,12 +116,22 @@ def latecomers(nodes: Collection[Child]) -> list[Child]:
     They were started again; or the machine was so busy that the others were through before these had begun. One that is
     connected with nobody begins whenever it comes.
     """
-    if len(nodes) == 1:
-        return []
     running = [child for child in nodes if child.running]
+    if len(running) == len(nodes):
+        return []
     again = all(child.restarts and child.status.get("phase") != "running" for child in running)
-    ended = len(running) < len(nodes) and all(child.status.get("phase") == "joining" for child in running)
-    return running if again or ended else []
+    return running if again or all(child.status.get("phase") == "joining" for child in running) else []
+
+
+def bereft(nodes: Collection[Child]) -> list[Child]:
+    """Of connected nodes, those that would wait for each other for ever, all having died at about the same time.
+
+    Each was started again to join the others, and there are no others: nobody takes steps, or has come to their end.
+    """
+    running = [child for child in nodes if child.running]
+    lost = all(child.restarts and child.status.get("phase", "joining") == "joining" for child in running)
+    begun = any(child.epoch_ns is not None for child in nodes)
+    return running if len(nodes) > 1 and begun and lost and not any(child.exit_code == 0 for child in nodes) else []
 
 
 def _let_finish(pid: int) -> None:

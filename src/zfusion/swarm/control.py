@@ -1,7 +1,7 @@
 """The line between a launcher and the processes that it started: JSON, a line a message, over a socket pair.
 
     child -> launcher    {"status": {...}}  {"report": {...}}  {"error": "...", "exit_code": 2}
-    launcher -> child    {"epoch_ns": ...} (to the network alone)  stop
+    launcher -> child    {"epoch_ns": ...}  stop
 
 When the launcher is gone, however it went, the child reads the end of the line and stops.
 """

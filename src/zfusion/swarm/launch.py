@@ -10,7 +10,6 @@ import signal
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from zfusion.drivers.registry import registered
 from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
-from zfusion.swarm.child import Child, latecomers
+from zfusion.swarm.child import Child, bereft, latecomers
 from zfusion.swarm.processes import processes
 from zfusion.swarm.standstill import STANDSTILL_S, Standstill, is_stopped
 
@@ -97,7 +96,7 @@ class Launcher:
         self._parts = {connected(i, links) for i in scenario.ids}
         """Nodes that wait for each other."""
         self._dismissed: set[str] = set()
-        """Nodes that came too late."""
+        """Nodes that were told to end before they had begun."""
         self._begun = False
         """Whether the swarm was seen to run."""
         file = options.logs / "scenario.toml"
@@ -181,7 +180,7 @@ class Launcher:
         while any(child.running for child in self._nodes.values()):
             self._look_after_all()
             self._give_up_stopped()
-            self._dismiss_latecomers()
+            self._help_who_finds_nobody()
             if self._interrupts and self._stop_by is None:
                 self._options.on_message("stopping (once more kills)")
                 self._stop_nodes()
@@ -193,13 +192,37 @@ class Launcher:
                 self._failures.append(f"{', '.join(stuck)}: did not stop within {STOP_S:g} s and had to be killed")
                 return
 
-    def _dismiss_latecomers(self) -> None:
-        for child in chain.from_iterable(latecomers([self._nodes[i] for i in part]) for part in self._parts):
-            if not child.restarts and child.name not in self._dismissed:
-                self._dismissed.add(child.name)
-                self._failures.append(f"{child.name} had not begun when all others had ended")
-            if child.line is not None:
-                child.line.stop()
+    def _help_who_finds_nobody(self) -> None:
+        """Have nodes end, or begin together, that would wait for ever for those that they are to join."""
+        if self._stop_by is not None:
+            return  # they all end, wherever they are
+        for part in self._parts:
+            nodes = [self._nodes[i] for i in part]
+            if left := bereft(nodes):
+                self._reunite(left, min(child.epoch_ns for child in nodes if child.epoch_ns is not None))
+                continue
+            for child in latecomers(nodes):
+                late = f"{child.name} had not begun when all others had ended"
+                self._dismiss(child, "" if child.restarts else late)
+
+    def _reunite(self, left: Sequence[Child], epoch_ns: int) -> None:
+        """Have nodes go on together that all died at about the same time, where steps have times: else all is lost."""
+        if self._scenario.timing.period_ns is None:
+            for child in left:
+                self._dismiss(child, f"{child.name} found nobody to join: all had died at about the same time")
+            return
+        for child in left:
+            if not child.resumes and child.line is not None:
+                child.resumes = True
+                child.line.tell(epoch_ns=self._clock.on_machine(epoch_ns))
+
+    def _dismiss(self, child: Child, failure: str) -> None:
+        """Have a node end that has not begun; if that is a `failure`, say so, once."""
+        if failure and child.name not in self._dismissed:
+            self._dismissed.add(child.name)
+            self._failures.append(failure)
+        if child.line is not None:
+            child.line.stop()
 
     def _give_up_stopped(self) -> None:
         """End processes that somebody has stopped, where the run can only wait for them, and has for too long."""
@@ -229,7 +252,7 @@ class Launcher:
         assert child.line is not None  # it was registered with its line
         for message in child.line.messages():
             if "status" in message:
-                child.status = message["status"]
+                child.note_status(message["status"])
                 self._note_beginning(child.status)
             elif "health" in message:
                 child.health = message["health"]
