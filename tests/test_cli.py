@@ -234,6 +234,26 @@ def test_bad_usage_is_exit_code_2(tmp_path: Path, refused: Refused, arguments: t
     assert said in refused(*arguments)[1]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "tiny.toml", "--record", "tiny.toml"),
+        ("launch", "tiny.toml", "--record", "tiny.toml"),
+        ("launch", "tiny.toml", "--links", "links.toml", "--record", "links.toml"),
+        ("launch", "read.toml", "--record", "y.csv"),
+        ("record", "tiny.toml", "-o", "tiny.toml"),
+    ],
+)
+def test_no_recording_replaces_what_is_read(tmp_path: Path, refused: Refused, arguments: tuple[str, ...]) -> None:
+    (tmp_path / "tiny.toml").write_text(SCENARIO)
+    (tmp_path / "read.toml").write_text(f'{SCENARIO}\n[source]\nkind = "csv"\nfile = "y.csv"\ncolumns = ["y"]\n')
+    (tmp_path / "y.csv").write_text("step,y\n1,1.0\n")
+    (tmp_path / "links.toml").write_text("[links]\nloss = 0.1\n")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert f"{arguments[-1]}: is one of the files that are read" in refused(*arguments)[1]
+    assert {path: path.read_bytes() for path in before} == before
+
+
 def test_what_is_refused_is_exit_code_2_of_the_process_too(tmp_path: Path) -> None:
     assert "nothing.toml" in zfusion("launch", "nothing.toml", cwd=tmp_path, code=2).stderr
     assert "frobnicate" in zfusion("frobnicate", cwd=tmp_path, code=2).stderr

@@ -114,6 +114,8 @@ def test_an_input_is_never_replaced(tmp_path: Path) -> None:
             merge([path], output)
         with pytest.raises(InputError, match="is one of the recordings that are read"):
             cut(path, output)
+    with pytest.raises(InputError, match="is one of the recordings that are read"):
+        cut(segment_path(path, 2), path)
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 

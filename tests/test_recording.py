@@ -29,11 +29,12 @@ from zfusion import gaps as gaps_module
 from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
-from zfusion.recording import GapCounter, Gaps, Record, Recording, arithmetic_differences, layout
+from zfusion.recording import GapCounter, Gaps, Keeping, Record, Recording, arithmetic_differences, layout
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info
-from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed
+from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed, segment_path
 from zfusion.recording.provenance import machine, software
+from zfusion.recording.recover import recover
 from zfusion.stages import TRUTH_SENDER, Field, Kind, Message, Stage
 
 ENVIRONMENT = os.environ | {
@@ -622,6 +623,26 @@ def test_exports_that_cannot_be(tmp_path: Path) -> None:
         for name in FORMATS:
             with pytest.raises(InputError, match="cannot be written"):
                 export(recording, tmp_path / "nowhere" / "r", name)
+
+
+def test_no_export_replaces_what_it_reads(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", traffic(200), keeping=Keeping(rotate_bytes=20_000))
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    assert len(before) > 2
+    for source, target in ((path, path), (path, segment_path(path, 1)), (segment_path(path, 2), path)):
+        for name in FORMATS:
+            with Recording.open(source) as recording, pytest.raises(InputError, match="is one of the recordings"):
+                export(recording, target, name)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for read_it in (Recording.open, lambda path: recover(path, tmp_path / "g.mcap")):
+        with pytest.raises(RecordingError, match=r"pipe: cannot be read: is not a regular file"):
+            read_it(tmp_path / "pipe")
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
 def test_the_documentation_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

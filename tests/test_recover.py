@@ -206,6 +206,15 @@ def test_the_file_itself_is_never_replaced(tmp_path: Path, original: Original) -
     assert path.read_bytes() == original.data
 
 
+def test_other_segments_are_never_replaced(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", traffic(200), keeping=Keeping(rotate_bytes=20_000))
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    for source, output in ((path, segment_path(path, 1)), (segment_path(path, 1), path)):
+        with pytest.raises(InputError, match="is one of the recordings that are read"):
+            recover(source, output)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
 def test_a_recovered_segment_takes_the_place_of_the_broken_one(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", traffic(200), keeping=Keeping(rotate_bytes=20_000))
     broken, size = segment_path(path, 1), len(read_plainly(segment_path(path, 1)))

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from oracles import brute_force
+from recordings import record as record_messages
+from recordings import traffic
 from simulations import (
     MS,
     altered,
@@ -39,7 +41,7 @@ from zfusion.errors import InputError
 from zfusion.links import Edge, Link, ideal
 from zfusion.messages import decode_any, encode_any
 from zfusion.model.scenario import Scenario
-from zfusion.recording import Record, Recording
+from zfusion.recording import Keeping, Record, Recording
 from zfusion.stages import Message
 from zfusion.used_sets import HISTORY_RUNS
 
@@ -579,6 +581,18 @@ def test_a_rerun_changes_only_what_it_is_told_to(tmp_path: Path) -> None:
         assert bare[0] == bare[1] == bare[2]
     for name in ("again.mcap", "lossy.mcap"):
         assert_all_identical(tmp_path / name)
+
+
+def test_a_rerun_replaces_nothing_that_it_reads(tmp_path: Path) -> None:
+    path = record_messages(tmp_path / "r.mcap", traffic(200), keeping=Keeping(rotate_bytes=20_000))
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    for output in before:
+        with (
+            Recording.open(path) as recording,
+            pytest.raises(InputError, match="is one of the recordings that are read"),
+        ):
+            rerun(recording, {}, output)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 def test_a_rerun_with_another_graph_is_the_simulation_with_that_graph(tmp_path: Path) -> None:

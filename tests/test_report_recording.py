@@ -250,7 +250,7 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
         write_report(tmp_path / "none.mcap", tmp_path / "r.html")
     with pytest.raises(RecordingError, match="is not an MCAP file"):
         write_report(Path(__file__), tmp_path / "r.html")
-    with pytest.raises(InputError, match="is the recording itself"):
+    with pytest.raises(InputError, match="is one of the recordings that are read"):
         write_report(SAMPLE, SAMPLE)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):

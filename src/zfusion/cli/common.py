@@ -6,7 +6,7 @@ import json
 import re
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from glob import escape
 from itertools import chain, count
@@ -110,8 +110,13 @@ def given_run(given: str | None, scenario: Scenario) -> str:
     return check_run(given or scenario.name)
 
 
-def recording_path(scenario: Scenario, run: str, record: Path | None, no_record: bool) -> Path | None:
-    """Where the recording goes, None where there is to be none; InputError for a place that cannot be made."""
+def recording_path(
+    scenario: Scenario, run: str, record: Path | None, no_record: bool, files: Iterable[Path | None]
+) -> Path | None:
+    """Where the recording goes, None where there is to be none; InputError for a place that cannot be made.
+
+    Nor may it be one of the `files` that the command was given, or of those that the scenario names.
+    """
     if record is not None and no_record:
         raise typer.BadParameter("--record and --no-record exclude each other")
     if no_record or (record is None and not scenario.recording.enabled):
@@ -126,7 +131,15 @@ def recording_path(scenario: Scenario, run: str, record: Path | None, no_record:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    keep_what_is_read(scenario, path, files)
     return path.absolute()
+
+
+def keep_what_is_read(scenario: Scenario, output: Path, files: Iterable[Path | None]) -> None:
+    """InputError if `output` is one of `files`, which the command was given, or of those that the scenario names."""
+    from zfusion.recording.paths import refuse_to_replace
+
+    refuse_to_replace(output, [*filter(None, files), *scenario.files_read()], "one of the files that are read")
 
 
 def default_directory(scenario: Scenario) -> Path:

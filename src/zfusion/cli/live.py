@@ -36,6 +36,7 @@ from zfusion.cli.common import (
     err,
     finish,
     given_run,
+    keep_what_is_read,
     load,
     node_named,
     on_signals,
@@ -84,7 +85,7 @@ def launch(
 
     loaded = load(scenario, steps, rate, free_run, seed, method, links, loss)
     name = run_name(run, loaded)
-    recording = recording_path(loaded, name, record, no_record)
+    recording = recording_path(loaded, name, record, no_record, (scenario, links))
     joined = netns_with or ("auto" if netns else None)
     summary = launched(loaded, name, recording, restart=restart, netns=joined, quiet=as_json)
     finish(summary, as_json, lambda: show_summary(out, summary))
@@ -163,7 +164,7 @@ def simulate(
 
     loaded = load(scenario, steps, rate, free_run, seed, method, links, loss)
     name = run_name(run, loaded)
-    path = recording_path(loaded, name, record, no_record)
+    path = recording_path(loaded, name, record, no_record, (scenario, links))
     design_first(loaded)
     with err.status(f"simulating {loaded.steps} steps of {len(loaded.ids)} nodes"):
         reports = run_simulation(loaded, run=name, output=path)
@@ -267,9 +268,11 @@ def record(
         name = given_run(run, loaded)
         logs.about(name)
         method = loaded.method.name
+        target = unused(output) if keep else output
+        keep_what_is_read(loaded, target, (scenario, zenoh_config))
         output.parent.mkdir(parents=True, exist_ok=True)
         writer = RecordingWriter(
-            unused(output) if keep else output,
+            target,
             scenario_toml=as_written.anchored().to_toml(),  # where keys are kept is nobody's business
             run=name,
             method=method,

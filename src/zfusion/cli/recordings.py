@@ -96,6 +96,7 @@ def replay(
     """Prove a recording (--verify), play it again (--publish), or run its measurements otherwise (-o)."""
     from zfusion.drivers.playback import Extent
     from zfusion.recording import Recording
+    from zfusion.recording.paths import refuse_to_replace
 
     if verify + publish + (output is not None) != 1:
         raise typer.BadParameter("expected one of --verify, --publish and --output")
@@ -105,6 +106,8 @@ def replay(
         elif output is not None:
             given = {"timing.late": late, "timing.window": window}
             settings = {path: value for path, value in given.items() if value is not None}
+            files = (scenario, Path(links) if links is not None and links != RECORDED else None)
+            refuse_to_replace(output, filter(None, files), "one of the files that are read")
             other = _other(opened, scenario, links, Overrides(method=method, seed=seed, loss=loss), settings)
             _rerun(opened, other, output, run, as_json)
         else:

@@ -104,7 +104,7 @@ def soak(
     _make(directory)
     if record is None and not no_record and loaded.recording.enabled:
         record = directory / f"{name}.mcap"
-    recording = recording_path(loaded, name, record, no_record)
+    recording = recording_path(loaded, name, record, no_record, (scenario, links))
     told = _soaked(loaded, name, directory, recording, interval_s, for_s, warm_up, restart=restart, quiet=as_json)
     finish(told, as_json, lambda: _show(told))
     if told["verdict"] in {"grows", "failed"}:

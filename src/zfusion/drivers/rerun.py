@@ -28,6 +28,7 @@ from zfusion.messages import Decoder
 from zfusion.methods import chosen as method_of
 from zfusion.model.scenario import Overrides, Scenario
 from zfusion.model.types import Array, NodeId
+from zfusion.recording.paths import refuse_to_replace
 from zfusion.recording.reader import Recording
 from zfusion.stages import ARRIVALS, ESTIMATE, MEASUREMENT, TRUTH, TRUTH_SENDER, Message
 
@@ -102,8 +103,7 @@ def rerun(
     InputError for a sensor that is not on the recording, or not of the size that the scenario says, or if `output`
     is the recording itself; otherwise as `simulate`.
     """
-    if output.exists() and output.samefile(recording.path):
-        raise InputError(f"{output}: is the recording that is to be run again")
+    refuse_to_replace(output, recording.not_to_replace)
     old = recorded_scenario(recording)
     wanted = scenario if isinstance(scenario, Scenario) else handed_on(old, old.with_overrides(**scenario))
     recorded = read_recorded(recording, wanted)

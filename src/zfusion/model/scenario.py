@@ -184,6 +184,18 @@ class Scenario(Spec):
         source = self._entries[i].source or self.source
         return source.with_paths(lambda path: str(self.absolute(path))).for_sensor(i)
 
+    def files_read(self) -> list[Path]:
+        """The files that it names for nodes and links to read: recordings, tables, code, traces, designs, keys."""
+        named: list[Path] = []
+
+        def note(path: str) -> str:
+            named.append(self.absolute(path))
+            return path
+
+        for piece in (*map(self.source_of, self.ids), self.transport, self.links, self.method):
+            piece.with_paths(note)
+        return named
+
     @property
     def truth_known(self) -> bool:
         """Whether the state itself is known: where every sensor is simulated."""

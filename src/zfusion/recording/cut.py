@@ -58,7 +58,8 @@ def cut(
         facts = {name: value for name, value in recording.metadata.items() if name not in OF_ITS_PLACE}
         without_step = 0
         of = recording.descriptions.__getitem__
-        with DerivedWriter(output, recording.files, facts, recording.scenario_toml, of, recording.design) as writer:
+        kept = recording.not_to_replace
+        with DerivedWriter(output, kept, facts, recording.scenario_toml, of, recording.design) as writer:
             for done, record in enumerate(recording.records(wanted), 1):
                 step = None if steps is None else _step(record.data)
                 without_step += steps is not None and step is None

@@ -16,6 +16,7 @@ from zfusion.recording import layout
 from zfusion.recording.accounts import Accounts, to_state
 from zfusion.recording.channels import Describe
 from zfusion.recording.file import Record
+from zfusion.recording.paths import refuse_to_replace
 from zfusion.recording.segment import SegmentWriter
 
 PART = ".part"
@@ -41,9 +42,7 @@ class DerivedWriter:
         describe: Describe,
         design: bytes | None = None,
     ) -> None:
-        for path in inputs:
-            if output.exists() and path.exists() and output.samefile(path):
-                raise InputError(f"{output}: is one of the recordings that are read")
+        refuse_to_replace(output, inputs)
         self.path = output
         self.accounts = Accounts()
         self._segment = SegmentWriter(

@@ -23,6 +23,7 @@ import numpy as np
 from zfusion import keys
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import decode_any
+from zfusion.recording.paths import refuse_to_replace
 from zfusion.recording.reader import Recording
 from zfusion.stages import BUILT_IN, HEADER, Kind, Stage
 
@@ -68,10 +69,11 @@ def export(
     """Write the messages of `recording`, or those chosen as in `Recording.records`, to `target`; replaces it.
 
     `stages` are the method's beside the built-in ones: they say which fields are matrices. InputError for a format
-    that is not one of `FORMATS`, and if the file cannot be written.
+    that is not one of `FORMATS`, if `target` is the recording itself, and if it cannot be written.
     """
     if format not in FORMATS:
         raise InputError(f"export format {format!r}: expected one of {', '.join(FORMATS)}")
+    refuse_to_replace(Path(target), recording.not_to_replace)
     source = _Source(recording, topics, start_ns, end_ns)
     matrices = {
         (stage.name, field.name)

@@ -35,6 +35,7 @@ from zfusion.recording.container import (
     read_at,
     unpack_chunk,
 )
+from zfusion.recording.paths import open_to_read
 
 EVER = 2**64
 """Later than every time that an MCAP file can say."""
@@ -133,7 +134,7 @@ class RecordedFile:
     def open(cls, path: Path) -> Self:
         """The file at `path`; RecordingError, naming it, if it cannot be read or trusted."""
         try:
-            file = path.open("rb")
+            file = open_to_read(path)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
         try:

@@ -16,6 +16,7 @@ whole recording by itself.
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Iterator, Mapping
 from glob import escape
@@ -89,6 +90,21 @@ def following_paths(first: Path) -> Iterator[Path]:
 def first_path(path: Path, number: int) -> Path:
     """Where the first segment is, if the one of that number is at `path`."""
     return path.with_name(f"{path.stem.removesuffix(f'.{number}')}{path.suffix}") if number else path
+
+
+def later_segments(first: Path) -> Iterator[tuple[int, Path]]:
+    """The segments that there are, by their names, after the first one, whose place is `first`: number and place."""
+    name = re.compile(rf"{re.escape(first.stem)}\.([1-9]\d{{0,8}}){re.escape(first.suffix)}")
+    if first.parent.is_dir():
+        for path in first.parent.iterdir():
+            if found := name.fullmatch(path.name):
+                yield int(found[1]), path
+
+
+def all_segments(path: Path, number: int) -> tuple[Path, ...]:
+    """The segments that there are, by their names, of the recording of which that one is at `path`."""
+    first = first_path(path, number)
+    return first, *(later for _, later in later_segments(first))
 
 
 def _checksum(facts: Mapping[str, str]) -> str:

@@ -107,7 +107,8 @@ def merge(sources: Sequence[Path], output: Path, advance: Callable[[int], None] 
             descriptions |= recording.descriptions
         files = [file for recording in recordings for file in recording.files]
         of = descriptions.__getitem__
-        with DerivedWriter(output, files, facts, first.scenario_toml, of, first.design) as writer:
+        inputs = [path for recording in recordings for path in recording.not_to_replace]
+        with DerivedWriter(output, inputs, facts, first.scenario_toml, of, first.design) as writer:
             counts, conflicting = _copy(recordings, writer, advance)
             alone = len(recordings) == 1 and first.statistics is not None
             statistics = first.statistics if alone and first.statistics is not None else writer.accounts.gaps()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +26,9 @@ class Recording:
         self.path = path
         self.files = tuple(file.path for file in files)
         """Where it is: one file, or its segments."""
+        in_segments = len(files) > 1 or first.number > 0
+        self.not_to_replace = {*self.files, *(layout.all_segments(first.path, first.number) if in_segments else ())}
+        """Where nothing is to be written while this is read: its files, and segments that it was not opened with."""
         self.size_bytes = sum(file.size_bytes for file in files)
         notes = [*(note for file in files for note in (file.note, file.derived.get("note", ""))), *notes]
         if layout.STOPPED in last.closing:
@@ -70,7 +72,7 @@ class Recording:
         path = Path(path)
         there = path
         if not path.exists():
-            there = min(_later_segments(path), default=(0, path))[1]
+            there = min(layout.later_segments(path), default=(0, path))[1]
         files = [RecordedFile.open(there)]
         notes = []
         try:
@@ -143,12 +145,3 @@ def _belongs(segment: RecordedFile, before: RecordedFile) -> bool:
         and all(segment.metadata.get(fact) == before.metadata.get(fact) for fact in same)
         and segment.scenario_toml == before.scenario_toml
     )
-
-
-def _later_segments(first: Path) -> Iterator[tuple[int, Path]]:
-    """The later segments that there are of a recording whose first one is not."""
-    name = re.compile(rf"{re.escape(first.stem)}\.([1-9]\d{{0,8}}){re.escape(first.suffix)}")
-    if first.parent.is_dir():
-        for path in first.parent.iterdir():
-            if found := name.fullmatch(path.name):
-                yield int(found[1]), path

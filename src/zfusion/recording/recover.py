@@ -17,6 +17,7 @@ from zfusion.recording.channels import described
 from zfusion.recording.container import chunk_messages, read_at, unpack_chunk
 from zfusion.recording.derived import DerivedWriter
 from zfusion.recording.file import EVER, Record
+from zfusion.recording.paths import open_to_read
 from zfusion.recording.salvage import Found, Loss, Place, Salvage
 
 
@@ -68,7 +69,7 @@ def recover(source: Path, output: Path, advance: Callable[[int], None] = lambda 
     `output` is the file itself; RunError if it cannot be written to its end.
     """
     try:
-        with source.open("rb") as file:
+        with open_to_read(source) as file:
             return _recover(source, file, output, advance)
     except (RecordingError, OSError, UnicodeDecodeError) as error:
         if isinstance(error, RecordingError) and str(error).startswith((f"{source}:", f"{output}:")):
@@ -91,7 +92,8 @@ def _recover(source: Path, file: BinaryIO, output: Path, advance: Callable[[int]
     known = _known_channels(found)
     descriptions = {channel.topic: described(channel, found.schemas) for channel in known.values()}
     of = descriptions.__getitem__
-    with DerivedWriter(output, [source], facts, found.scenario_toml, of, found.design) as writer:
+    kept = _not_to_replace(source, found, facts)
+    with DerivedWriter(output, kept, facts, found.scenario_toml, of, found.design) as writer:
         for place in found.places:
             for record in _records(file, place, known, found):
                 writer.add(record)
@@ -99,6 +101,13 @@ def _recover(source: Path, file: BinaryIO, output: Path, advance: Callable[[int]
         told = _tell(source, file, output, found, known, writer)
         _finish(source, found, writer, told)
     return told
+
+
+def _not_to_replace(source: Path, found: Found, facts: Mapping[str, str]) -> tuple[Path, ...]:
+    """The file itself and, where it may be one of several, the other segments that there are."""
+    number, closing = int(facts.get(layout.SEGMENT, "0")), found.metadata.get(layout.CLOSE)
+    in_segments = number > 0 or closing is None or layout.NEXT in closing
+    return source, *(layout.all_segments(source, number) if in_segments else ())
 
 
 def _known_channels(found: Found) -> dict[int, Channel]:

@@ -15,6 +15,7 @@ from zfusion.errors import InputError
 from zfusion.model.types import Array, NodeId
 from zfusion.recording.info import RecordingInfo
 from zfusion.recording.info import info as information
+from zfusion.recording.paths import refuse_to_replace
 from zfusion.recording.reader import Recording
 from zfusion.report.figures import latency, over_time, space_time, topology
 from zfusion.report.figures.quantities import Quantity, in_seconds, shown
@@ -41,9 +42,8 @@ def write_report(recording: Path, output: Path, steps: range | None = None, figu
     that are not on the recording and for a place that cannot be written; otherwise as `Recording.open` and
     `recorded_scenario`.
     """
-    if output.exists() and recording.exists() and output.samefile(recording):
-        raise InputError(f"{output}: is the recording itself")
     with Recording.open(recording) as opened:
+        refuse_to_replace(output, opened.not_to_replace)
         facts = RunFacts(opened)
         page = _page(facts, information(opened), _there(facts, steps))
     if figures is not None:
