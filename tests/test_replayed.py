@@ -617,7 +617,7 @@ def test_some_of_the_sensors(tmp_path: Path) -> None:
         wider = document | {"sensors": [{"id": 10, "H": [[1.0, 0.0], [0.0, 1.0]], "R": [[1.0, 0.0], [0.0, 1.0]]}]}
         with pytest.raises(InputError, match=r"sensor 10.*wrong_shape"):
             rerun(recording, Scenario.model_validate(wider), tmp_path / "x.mcap")
-        with pytest.raises(InputError, match="is the recording"):
+        with pytest.raises(InputError, match="is one of the recordings that are read"):
             rerun(recording, {}, path)
 
 

@@ -20,11 +20,9 @@ before. Messages are taken as they come and forgotten when nobody needs them any
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import repeat
-from multiprocessing import get_context
+from functools import partial
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import cast
@@ -35,6 +33,7 @@ from zfusion import keys
 from zfusion.drivers.account import setting_of
 from zfusion.drivers.lives import Doubt, Life, Place, Shelf
 from zfusion.drivers.verdict import NAMED, TOLERANCE, Difference, Tally, Verdict
+from zfusion.drivers.workers import in_order
 from zfusion.errors import MessageError
 from zfusion.gaps import MAX_LIVES
 from zfusion.messages import Decoder, Reason, encode_any
@@ -451,7 +450,7 @@ def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 
 
     Reads the recording once, in memory that does not grow with its length; with `jobs` > 1, so many processes do so,
     each for some of the nodes. ScenarioError if its scenario cannot be read by this version, InputError if it does not
-    know the method, RecordingError if the file has changed.
+    know the method, RecordingError if the file has changed, RunError if one of these processes dies.
     """
     scenario = recorded_scenario(recording)
     arithmetic = arithmetic_differences(recording.metadata)
@@ -461,9 +460,8 @@ def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 
     if jobs == 1:
         parts = [_verify_some(recording, scenario, scenario.ids, tolerance)]
     else:
-        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            shares = [scenario.ids[n::jobs] for n in range(jobs)]
-            parts = list(pool.map(_verify_file, repeat(recording.path), shares, repeat(tolerance)))
+        shares = [scenario.ids[n::jobs] for n in range(jobs)]
+        parts = list(in_order(partial(_verify_file, recording.path, tolerance), shares, jobs))
     tallies = {node: tally for part in parts for node, tally in part.tallies.items()}
     missing = [what for part in parts for what in part.missing]
     firsts = sorted(filter(None, (part.first for part in parts)), key=itemgetter(0))
@@ -480,7 +478,7 @@ def verify(recording: Recording, *, tolerance: float | None = None, jobs: int = 
     )
 
 
-def _verify_file(path: Path, nodes: Sequence[NodeId], tolerance: float | None) -> _Part:
+def _verify_file(path: Path, tolerance: float | None, nodes: Sequence[NodeId]) -> _Part:
     """What a process of its own does."""
     with Recording.open(path) as recording:
         return _verify_some(recording, recorded_scenario(recording), nodes, tolerance)

@@ -18,6 +18,7 @@ from zfusion import keys
 from zfusion.drivers.replayed import recorded_scenario
 from zfusion.drivers.rerun import Recorded, read_recorded
 from zfusion.drivers.simulated import Simulation
+from zfusion.drivers.workers import in_order
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import Decoder
 from zfusion.methods import chosen
@@ -27,7 +28,6 @@ from zfusion.model.types import Array, NodeId
 from zfusion.recording.reader import Recording
 from zfusion.stages import ESTIMATE, Message
 from zfusion.studies.paired import MEDIAN, Paired, paired
-from zfusion.studies.parallel import in_order
 
 Metric = Literal["mse", "nees", "disagreement"]
 

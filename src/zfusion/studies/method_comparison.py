@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zfusion.drivers.workers import in_order
 from zfusion.errors import InputError
 from zfusion.methods import chosen
 from zfusion.methods.prediction import predict
@@ -33,7 +34,6 @@ from zfusion.studies.compare import (
 from zfusion.studies.contestants import Field
 from zfusion.studies.intervals import Interval, mean_interval
 from zfusion.studies.method_runs import Cost, SeedRun, run_all
-from zfusion.studies.parallel import in_order
 
 BELIEVED = 0.05
 """By how much of itself a mean NEES may be off before covariances are not to be believed."""

@@ -21,6 +21,7 @@ from functools import partial
 
 import numpy as np
 
+from zfusion.drivers.workers import in_order
 from zfusion.errors import InputError
 from zfusion.methods.ensemble import Ensemble, copies_at_once
 from zfusion.methods.layout import Bools
@@ -32,7 +33,6 @@ from zfusion.studies.certainty import certainty
 from zfusion.studies.enumeration import ByNode, exact_means
 from zfusion.studies.fates import Fate, covered, fate_of, method_network
 from zfusion.studies.intervals import t_quantile
-from zfusion.studies.parallel import in_order
 
 CONFIDENCE = 0.95
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from zfusion.drivers.metrics import NodeReport
+from zfusion.drivers.workers import ONE_THREAD
 from zfusion.model.types import NodeId
 from zfusion.swarm.control import LauncherEnd
 
@@ -21,9 +22,6 @@ TAIL_LINES = 15
 
 TAIL_BYTES = 65_536
 """Bytes from the end of a log in which those lines are looked for: logs may be long."""
-
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""A node's matrices are small: threads of a BLAS only get into each other's way, and the other nodes'."""
 
 
 @dataclass(slots=True)

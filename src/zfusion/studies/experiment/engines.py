@@ -10,12 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+from zfusion.drivers.workers import DIED, workers
 from zfusion.errors import InputError
 from zfusion.studies.experiment.execute import Result, execute
 from zfusion.studies.experiment.plan import Task
-from zfusion.studies.parallel import workers
-
-DIED = "its process died: killed, or out of memory"
 
 DASK_CONNECT_S = "10s"
 
