@@ -268,6 +268,17 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     assert peaks[1] < peaks[0] + 2_000_000
 
 
+def test_a_long_tail_of_nothing_is_not_taken_into_memory(tmp_path: Path, original: Original) -> None:
+    path, tail = tmp_path / "r.mcap", 200_000_000
+    path.write_bytes(original.data)
+    with path.open("r+b") as file:
+        file.truncate(len(original.data) + tail)
+    told: list[Recovery] = []
+    assert peak_memory(lambda: told.append(recover(path, tmp_path / "g.mcap"))) < tail // 4
+    assert told[0].messages == 300
+    assert told[0].dropped_bytes >= tail
+
+
 # --- fuzzing ----------------------------------------------------------------------------------------------------
 
 

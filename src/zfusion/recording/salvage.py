@@ -199,7 +199,7 @@ class Salvage:
     def _account(self, start: int, end: int) -> None:
         """Tell what of the bytes between two pieces is damage; the rest are indexes, which are made anew."""
         place, data = start, self._data
-        while place < end and not (end == len(data) and data[place:] == MAGIC):
+        while place < end and not self._is_end(place):
             length = frame_length(data, place)
             whole = is_well_formed(data, place) and place + length <= end
             if whole and data[place] != Opcode.CHUNK:
@@ -209,6 +209,10 @@ class Salvage:
             self._lose(place, length)
             place += length
 
+    def _is_end(self, place: int) -> bool:
+        """Whether nothing but the mark of a finished file's end is left. Copies no more than that."""
+        return len(self._data) - place == len(MAGIC) and self._data[place:] == MAGIC
+
     def _lose(self, place: int, length: int) -> None:
         self._found.losses += 1
         self._found.lost_bytes += length
@@ -216,7 +220,7 @@ class Salvage:
             self._found.lost.append(Loss(place, length, self._why(place, place + length)))
 
     def _why(self, start: int, end: int) -> str:
-        if not any(map(any, self._blocks(start, end))):
+        if all(block.count(0) == len(block) for block in self._blocks(start, end)):
             return "zeros"
         if end - start < 9 or start + frame_length(self._data, start) > len(self._data):
             return "a record that is not all there" if end == len(self._data) else "no record"
