@@ -159,12 +159,19 @@ def test_what_says_no_step_is_left_out_and_counted(tmp_path: Path) -> None:
     assert read(tmp_path / "c.mcap")[-1] == sent[-1]
 
 
+def test_a_node_that_is_named_again_is_one_node(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", traffic(3))
+    assert cut(path, tmp_path / "c.mcap", nodes=["1", "1", "1"]).what == "all steps of node 1"
+
+
 def test_cuts_of_nothing_are_refused(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", traffic(3))
     with pytest.raises(InputError, match=r"r\.mcap: steps 7 to 9 of all nodes: there is nothing of these on it"):
         cut(path, tmp_path / "c.mcap", steps=range(7, 10))
     with pytest.raises(InputError, match=r"r\.mcap: node 9: expected some of 1, 2"):
         cut(path, tmp_path / "c.mcap", nodes=["1", "9"])
+    with pytest.raises(InputError, match=r"r\.mcap: node '': expected some of 1, 2"):
+        cut(path, tmp_path / "c.mcap", nodes=["1", "", "2"])
     assert not list(tmp_path.glob("c*"))
 
 

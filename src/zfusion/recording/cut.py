@@ -51,9 +51,10 @@ def cut(
     """
     with Recording.open(source) as recording:
         senders = {topic: _sender(topic) for topic in recording.topics}
-        if nodes is not None and (unknown := set(nodes) - set(senders.values())):
-            known = ", ".join(sorted(node for node in set(senders.values()) if node))
-            raise InputError(f"{source}: node {min(unknown)}: expected some of {known}")
+        known = {node for node in senders.values() if node}
+        nodes = None if nodes is None else set(nodes)
+        if nodes is not None and (unknown := nodes - known):
+            raise InputError(f"{source}: node {min(unknown) or repr('')}: expected some of {', '.join(sorted(known))}")
         wanted = {topic for topic, node in senders.items() if nodes is None or node in nodes or node == TRUTH}
         facts = {name: value for name, value in recording.metadata.items() if name not in OF_ITS_PLACE}
         without_step = 0
