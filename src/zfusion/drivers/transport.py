@@ -185,7 +185,7 @@ def _config(
                 config.insert_json5(f"{what}/endpoints", json.dumps(list(given)))
             except zenoh.ZError:
                 expected = "expected Zenoh endpoints, like tcp/10.0.0.1:7450"
-                raise InputError(f"{what}: {expected} (is {_listed(given)})") from None
+                raise InputError(f"{what}: {expected} (is {', '.join(given)})") from None
     return config
 
 

@@ -19,7 +19,6 @@ import json
 import re
 import zlib
 from collections.abc import Iterator, Mapping
-from glob import escape
 from pathlib import Path
 
 FORMAT = "1"
@@ -78,13 +77,6 @@ def unsealed(facts: Mapping[str, str]) -> dict[str, str]:
 def segment_path(first: Path, number: int) -> Path:
     """Where the segment of that number is, if the first one is at `first`."""
     return first if number == 0 else first.with_name(f"{first.stem}.{number}{first.suffix}")
-
-
-def following_paths(first: Path) -> Iterator[Path]:
-    """The files that are there by the names of the segments after the one at `first`, in no order."""
-    for path in first.parent.glob(f"{escape(first.stem)}.*{escape(first.suffix)}"):
-        if path.stem.removeprefix(f"{first.stem}.").isdecimal():
-            yield path
 
 
 def first_path(path: Path, number: int) -> Path:

@@ -189,7 +189,7 @@ class RecordingWriter:
 
     def _look_for_others(self) -> None:
         """OSError if a recording that began at the same place is being written, though in another file by now."""
-        if any(map(is_claimed, layout.following_paths(self.path))):
+        if any(is_claimed(path) for _, path in layout.later_segments(self.path)):
             raise OSError(errno.EBUSY, TAKEN)
 
     def _following(self, start: dict[str, str]) -> SegmentWriter:
