@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -18,6 +20,7 @@ from typer.main import get_command
 
 from oracles.paper import ERROR_VARIANCES
 from zfusion import __version__
+from zfusion.__main__ import main
 from zfusion.cli import app, run
 from zfusion.cli.common import unused
 
@@ -257,6 +260,56 @@ def test_no_recording_replaces_what_is_read(tmp_path: Path, refused: Refused, ar
 def test_what_is_refused_is_exit_code_2_of_the_process_too(tmp_path: Path) -> None:
     assert "nothing.toml" in zfusion("launch", "nothing.toml", cwd=tmp_path, code=2).stderr
     assert "frobnicate" in zfusion("frobnicate", cwd=tmp_path, code=2).stderr
+
+
+@pytest.mark.parametrize("words", [("--version",), ("design", FOUR, "--steps", "5"), ("design", FOUR, "--json")])
+@pytest.mark.parametrize(("target", "reason"), [(">/dev/full", "No space left on device"), (">&-", "it is closed")])
+def test_standard_output_that_cannot_be_written_is_told_in_a_line(
+    tmp_path: Path, words: tuple[str, ...], target: str, reason: str
+) -> None:
+    command = shlex.join([sys.executable, "-m", "zfusion", *words])
+    done = subprocess.run(
+        f"{command} {target}", shell=True, cwd=tmp_path, stderr=subprocess.PIPE, text=True, timeout=90
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"error: standard output cannot be written: {reason}\n"
+
+
+def test_a_reader_that_has_enough_is_no_trouble(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    command = subprocess.Popen(
+        [sys.executable, "-m", "zfusion", "--help"], cwd=tmp_path, stdout=writing, stderr=subprocess.PIPE, text=True
+    )
+    os.close(reading)
+    os.close(writing)
+    assert command.communicate(timeout=90)[1] == ""
+
+
+@pytest.mark.parametrize("module", ["zfusion.cli", "numpy", "typer", "zfusion.cli.soak", "zfusion.drivers.observer"])
+def test_an_interrupt_at_the_beginning_is_no_failure(tmp_path: Path, module: str) -> None:
+    """A hook of Python's own has the signal come just when a module is imported: on no clock."""
+    program = f"""
+import os, signal, sys
+from zfusion.__main__ import main
+def interrupted(event, args):
+    if event == "import" and args[0] == {module!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+sys.addaudithook(interrupted)
+sys.argv = ["zfusion", "status"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=90)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_an_interrupt_while_the_commands_are_put_together_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("zfusion.cli.run", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
 
 
 def test_version_is_told(tmp_path: Path) -> None:

@@ -4,6 +4,16 @@ The front door is the command line (``zfusion --help``) and `zfusion.model.scena
 `zfusion.node`.
 """
 
-from importlib.metadata import version
+from typing import TYPE_CHECKING
 
-__version__ = version("zfusion")
+__version__: str
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> str:
+        """The version, looked up when somebody asks: that takes a while, and nobody listens to Ctrl-C before."""
+        if name == "__version__":
+            from importlib.metadata import version  # noqa: PLC0415
+
+            return version(__name__)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

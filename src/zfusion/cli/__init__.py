@@ -31,6 +31,7 @@ from zfusion.cli import (
     supervision,
 )
 from zfusion.cli.common import err, out
+from zfusion.cli.output import checked_output
 from zfusion.errors import ZfusionError
 
 app = typer.Typer(
@@ -71,7 +72,8 @@ app.add_typer(library.app, name="library", rich_help_panel="Studies")
 def run() -> None:
     """Run the command line and exit."""
     try:
-        app()
+        with checked_output():
+            app()
     except ZfusionError as error:
         if logs.as_json():
             logs.log.error("%s", error)
