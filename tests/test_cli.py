@@ -269,7 +269,7 @@ def test_standard_output_that_cannot_be_written_is_told_in_a_line(
 ) -> None:
     command = shlex.join([sys.executable, "-m", "zfusion", *words])
     done = subprocess.run(
-        f"{command} {target}", shell=True, cwd=tmp_path, stderr=subprocess.PIPE, text=True, timeout=90
+        f"{command} {target}", check=False, shell=True, cwd=tmp_path, stderr=subprocess.PIPE, text=True, timeout=90
     )
     assert done.returncode == 1
     assert done.stderr == f"error: standard output cannot be written: {reason}\n"
@@ -298,7 +298,9 @@ sys.addaudithook(interrupted)
 sys.argv = ["zfusion", "status"]
 main()
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=90)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, check=False, capture_output=True, text=True, timeout=90
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 

@@ -17,7 +17,10 @@ import pytest
 from supervisors import Systemd
 from swarms import Command, run_name, variant, wait_until, zfusion
 from zfusion.drivers.notify import Health, Supervisor, verdict
+from zfusion.drivers.registry import birth
 from zfusion.errors import InputError
+
+BIRTH = '{"ready": true, "status": "", "pid": 1, "at_ns": 1, "birth": 7}'
 
 pytestmark = pytest.mark.timeout(method="thread")  # the other one uses the timer that the signs of life need
 
@@ -106,7 +109,7 @@ def test_health_file(tmp_path: Path) -> None:
 
 def test_verdicts() -> None:
     def told(*, ready: bool, age_s: float, alive: bool) -> bool:
-        health = Health(ready, "", 1, time.monotonic_ns() - int(age_s * 1e9))
+        health = Health(ready, "", os.getpid(), time.monotonic_ns() - int(age_s * 1e9), birth(os.getpid()))
         return verdict(health, alive=alive, within_s=30.0)[0]
 
     assert told(ready=True, age_s=0, alive=False)
@@ -116,7 +119,24 @@ def test_verdicts() -> None:
     assert not told(ready=True, age_s=40, alive=True)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"ready": 1, "status": "", "pid": 1, "at_ns": 1}'])
+def test_a_process_that_was_killed_is_not_alive_any_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "health"
+    monkeypatch.setenv("ZFUSION_HEALTH_FILE", str(file))
+    with alone(tmp_path) as node:
+        wait_until(lambda: file.exists() and Health.read(file).ready, "it runs")
+        alive = zfusion(tmp_path, "health", file, "--alive", "--within", 3600)
+        node.process.kill()
+        node.process.wait()
+        dead = zfusion(tmp_path, "health", file, "--alive", "--within", 3600)
+    assert (alive.code, dead.code) == (0, 1)
+    assert dead.out.startswith("gone; its last word: running")
+    another = json.loads(file.read_text()) | {"pid": os.getpid()}  # whoever has its id now
+    assert not verdict(Health(**another), alive=True, within_s=3600)[0]
+    told_none = Health(**{**another, "birth": None})
+    assert verdict(told_none, alive=True, within_s=3600)[0]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"ready": 1, "status": "", "pid": 1, "at_ns": 1}', BIRTH])
 def test_what_is_no_health_file_is_refused(tmp_path: Path, text: str) -> None:
     file = tmp_path / "health"
     file.write_text(text)

@@ -25,6 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from zfusion.drivers import registry
 from zfusion.drivers.metrics import RecorderReport
 from zfusion.errors import InputError
 from zfusion.status import Phase, Status
@@ -55,6 +56,8 @@ class Health:
     pid: int
     at_ns: int
     """When, on the clock that never jumps, which all processes of a machine have in common."""
+    birth: str | None = None
+    """What tells the process from others that had, or will have, its id; None where it was not told."""
 
     @classmethod
     def read(cls, path: Path) -> Health:
@@ -65,11 +68,18 @@ class Health:
             for name, kind in (("ready", bool), ("status", str), ("pid", int), ("at_ns", int)):
                 if type(told[name]) is not kind:
                     raise TypeError(name)
+            if not isinstance(health.birth, str | None):
+                raise TypeError("birth")
         except OSError as error:
             raise InputError(f"{path}: no health file that can be read: {error.strerror}") from None
         except (ValueError, TypeError, KeyError):
             raise InputError(f"{path}: expected a health file, as processes write it into {HEALTH_FILE}") from None
         return health
+
+    @property
+    def gone(self) -> bool:
+        """Whether the process has ended; for a reader on the machine, or in the container, that it is in."""
+        return self.birth is not None and registry.birth(self.pid) != self.birth
 
     @property
     def age_s(self) -> float:
@@ -195,17 +205,19 @@ class Supervisor:
         """To the file, whole."""
         if self._file is None:
             return
-        health = Health(self._ready, self._status, os.getpid(), time.monotonic_ns())
-        whole = self._file.with_name(f".{self._file.name}.{os.getpid()}")
+        pid = os.getpid()
+        health = Health(self._ready, self._status, pid, time.monotonic_ns(), registry.birth(pid))
+        whole = self._file.with_name(f".{self._file.name}.{pid}")
         whole.write_text(json.dumps(asdict(health)))
         whole.replace(self._file)
 
 
 def verdict(health: Health, *, alive: bool, within_s: float) -> tuple[bool, dict[str, Any]]:
-    """Whether a process is well, or at least `alive`: it has shown so `within_s`; and all that is known of it."""
-    fresh = health.age_s <= within_s
-    well = fresh and (alive or health.ready)
-    return well, {"ok": well, "ready": health.ready, "status": health.status, "age_s": round(health.age_s, 3)}
+    """Whether a process is well, or at least `alive`: there, and has shown so `within_s`; and what is known of it."""
+    gone = health.gone
+    well = not gone and health.age_s <= within_s and (alive or health.ready)
+    status = f"gone; its last word: {health.status}" if gone else health.status
+    return well, {"ok": well, "ready": health.ready, "status": status, "age_s": round(health.age_s, 3)}
 
 
 def _address(text: str) -> str | bytes:
