@@ -48,6 +48,8 @@ from zfusion.drivers.simulated import simulate
 from zfusion.drivers.transport import open_session, publisher
 from zfusion.errors import InputError
 from zfusion.model.scenario import load_scenario
+from zfusion.report.exporters import push
+from zfusion.report.metrics import Family
 from zfusion.report.swarm_table import seen_swarm
 from zfusion.status import Phase, Status
 from zfusion.swarm.ports import free_endpoints
@@ -117,14 +119,18 @@ def test_status_tells_of_every_node_and_of_the_recorder(run: str, directory: Pat
     assert told["missing"] == []
 
 
-def test_tables_fit_into_eighty_columns(run: str, directory: Path) -> None:
+@pytest.mark.parametrize("columns", [80, 60, 40])
+def test_tables_fit(run: str, directory: Path, columns: int) -> None:
     command = [sys.executable, "-m", "zfusion", "top", "--once", "--interval", "0.2"]
-    environment = {**os.environ, "COLUMNS": "80"}
+    environment = {**os.environ, "COLUMNS": str(columns)}
     lines = subprocess.run(
         command, cwd=directory, env=environment, capture_output=True, text=True, check=True, timeout=60
     ).stdout.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert all(any(line.split()[:2] == [name, "running"] for line in lines) for name in NODES)
+    assert max(map(len, lines)) <= columns
+    rows = {words[0]: words for line in lines if len(words := line.split()) > 2 and words[0] in NODES}
+    assert {name: row[1] for name, row in rows.items()} == dict.fromkeys(NODES, "running")
+    assert all(row[2].isdecimal() for row in rows.values())  # the whole of it, whatever is left out
+    assert ("estimate" in "".join(lines)) == (columns >= 60)
 
 
 def test_echo_prints_messages(run: str, directory: Path) -> None:
@@ -191,6 +197,28 @@ def test_metrics_are_served_and_pushed(run: str, directory: Path) -> None:
     assert second["zfusion_stage_wait_seconds_bucket", ("le", "+Inf"), *wait] == count
     told = ExportMetricsServiceRequest.FromString(pushed[0]).resource_metrics[0].scope_metrics[0].metrics
     assert "zfusion_node_steps" in {metric.name for metric in told}
+
+
+@pytest.mark.parametrize("url", ["garbage", "collector:4318", "ftp://collector/v1/metrics", "http://", "http://a b/"])
+def test_where_metrics_cannot_be_pushed_is_refused(url: str) -> None:
+    with pytest.raises(InputError, match="--otlp: expected a URL"):
+        push(list, url, 1.0)
+
+
+def test_pushing_to_a_collector_that_is_not_there_ends_soon() -> None:
+    tried = threading.Event()
+
+    def families() -> list[Family]:
+        tried.set()
+        return [Family("up", "gauge", "", (), {(): 1.0})]
+
+    [endpoint] = free_endpoints(1)
+    end = push(families, f"http://{endpoint.removeprefix('tcp/')}/v1/metrics", 0.1)
+    tried.clear()
+    assert tried.wait(PATIENCE_S)
+    begins = time.monotonic()
+    end()
+    assert time.monotonic() - begins < 7.0  # the exporter, left to itself, tries for ten seconds
 
 
 def _scraped(url: str) -> dict[tuple[Any, ...], float]:

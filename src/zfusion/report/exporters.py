@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from importlib import import_module
@@ -10,6 +11,11 @@ from typing import Any
 
 from zfusion.errors import InputError
 from zfusion.report.metrics import Family, Histogram
+
+URL = re.compile(r"https?://([^\s/@]*@)?(\[[0-9A-Fa-f:.]+\]|[^\s/:?#\[\]]+)(:\d{1,5})?([/?][^\s]*)?")
+
+LAST_PUSH_S = 2.0
+"""How long the last push may take: where nobody takes it, it would be tried again for ten seconds."""
 
 Look = Callable[[], Iterable[Family]]
 """Gives the metrics as they are now; called from other threads, never from two at once."""
@@ -37,7 +43,12 @@ def serve(look: Look, host: str, port: int) -> tuple[int, Callable[[], None]]:
 
 
 def push(families: Callable[[], Iterable[Family]], endpoint: str, interval_s: float) -> Callable[[], None]:
-    """Push the metrics, but for histograms, to an OTLP collector (HTTP) every so often; gives what ends that."""
+    """Push the metrics, but for histograms, to an OTLP collector (HTTP) every so often; gives what ends that.
+
+    InputError where the extra is not installed, or the endpoint is no URL.
+    """
+    if not URL.fullmatch(endpoint):
+        raise InputError(f"--otlp: expected a URL like http://collector:4318/v1/metrics (is {endpoint!r})")
     sdk = _needs("opentelemetry.sdk.metrics", "opentelemetry-sdk")
     export = _needs("opentelemetry.sdk.metrics.export", "opentelemetry-sdk")
     otlp = _needs("opentelemetry.exporter.otlp.proto.http.metric_exporter", "opentelemetry-exporter-otlp-proto-http")
@@ -50,8 +61,7 @@ def push(families: Callable[[], Iterable[Family]], endpoint: str, interval_s: fl
             declare = meter.create_observable_counter if family.kind == "counter" else meter.create_observable_gauge
             name = family.name.removesuffix("_total")
             declare(name, [partial(_observe, families, family.name)], description=family.help)
-    end: Callable[[], None] = provider.shutdown
-    return end
+    return partial(provider.shutdown, timeout_millis=1000 * LAST_PUSH_S)
 
 
 def _observe(families: Callable[[], Iterable[Family]], name: str, _options: Any) -> Iterator[Any]:

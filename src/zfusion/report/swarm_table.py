@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -20,6 +21,20 @@ from zfusion.status import Counts, Phase
 
 WIDE = 110
 """Columns of a terminal from which on a table tells more."""
+
+ESTIMATE = "estimate ± sd"
+
+SPARE = ("machine", "clock", "CPU s", "skipped", "missed", "refused", "fallb.", "late", ESTIMATE, "lost", "rate/s")
+"""Columns that a narrow terminal does without, the first of them first."""
+
+LEAST_ESTIMATE = 10
+"""Characters of an estimate from which on it is worth a column."""
+
+MOST_MACHINE = 16
+"""Characters of a machine's name that are shown."""
+
+GAP = 2
+"""Columns of the terminal between two of the table's; half of it on either edge."""
 
 STYLES = {"running": "green", "recording": "green", "joining": "yellow", "silent": "yellow", "done": "blue"}
 ABSENT = {"missing": "red", "gone": "red", "left": "dim"}
@@ -42,23 +57,12 @@ def seen_swarm(observer: Observer) -> dict[str, Any]:
 def swarm_table(observer: Observer, width: int, height: int | None = None) -> Group:
     """The same as a table that fits into the columns, and into the lines where they are limited."""
     wide = width >= WIDE
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title_justify="left")
-    table.title = Text(f"{observer.run}", style="bold")
-    for name in ("node", "state"):
-        table.add_column(name, no_wrap=True)
-    numbers = ["step", "rate/s", "fallb.", "lost", "late", "refused"]
-    numbers += ["missed", "skipped", "CPU s", "clock"] if wide else []
-    for name in numbers:
-        table.add_column(name, justify="right", no_wrap=True)
-    if wide:
-        table.add_column("machine", no_wrap=True, overflow="ellipsis", max_width=16)
-    table.add_column("estimate ± sd", no_wrap=True, overflow="ellipsis")
     shown = list(observer.nodes.items())
     if height is not None and len(shown) > (room := max(4, height - 8)):
         ended = {"running", "left"}
         shown = sorted(shown, key=lambda item: item[1].state in ended)[:room]  # trouble first
-    for name, node in shown:
-        table.add_row(*_row(name, node, wide))
+    table = _table([_row(name, node, wide) for name, node in shown], width, wide)
+    table.title = Text(f"{observer.run}", style="bold")
     lines: list[Table | Text] = [table]
     if len(shown) < len(observer.nodes):
         lines.append(Text(f"... and {len(observer.nodes) - len(shown)} more nodes"))
@@ -67,6 +71,30 @@ def swarm_table(observer: Observer, width: int, height: int | None = None) -> Gr
     lines += [Text(f"missing: {', '.join(map(printable, observer.missing))}", style="red")] if observer.missing else []
     lines += [Text(printable(note), style="yellow") for note in notes_on(observer)]
     return Group(*lines)
+
+
+def _table(rows: Sequence[Sequence[Text | str]], width: int, wide: bool) -> Table:
+    """As much of the rows as fits; who a node is, its state and its step in any case."""
+    numbers = ["step", "rate/s", "fallb.", "lost", "late", "refused"]
+    numbers += ["missed", "skipped", "CPU s", "clock"] if wide else []
+    names = ["node", "state", *numbers, *(["machine"] if wide else []), ESTIMATE]
+    cells = [dict(zip(names, row, strict=False)) for row in rows]  # who has told nothing has a name and a state only
+    widths = {name: max(cell_len(name), *(cell_len(str(row.get(name, ""))) for row in cells), 0) for name in names}
+    if wide:
+        widths["machine"] = min(MOST_MACHINE, widths["machine"])
+    whole, widths[ESTIMATE] = widths[ESTIMATE], LEAST_ESTIMATE
+    for name in SPARE:
+        if sum(widths.values()) + GAP * len(widths) > width:
+            widths.pop(name, None)
+    if ESTIMATE in widths:  # what is left is its
+        widths[ESTIMATE] = min(whole, LEAST_ESTIMATE + width - sum(widths.values()) - GAP * len(widths))
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title_justify="left")
+    for name, most in widths.items():
+        justify: Literal["left", "right"] = "right" if name in numbers else "left"
+        table.add_column(name, justify=justify, no_wrap=True, overflow="ellipsis", max_width=most)
+    for row in cells:
+        table.add_row(*(row.get(name, "") for name in widths))
+    return table
 
 
 def notes_on(observer: Observer) -> list[str]:
