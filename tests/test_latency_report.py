@@ -86,6 +86,20 @@ def test_several_lives_are_told_as_one() -> None:
             assert edge["used_fraction"] == edge["received"] / 54
 
 
+def test_lives_that_ended_without_a_report_are_told_beside_the_sums_that_lack_them() -> None:
+    scenario = walk(steps=64)
+    simulation = Simulation(scenario)
+    simulation.run()
+    told = summarize("r", scenario, simulation.reports, None)
+    assert told["unreported_lives"] == 0
+    assert "without what" not in shown(told)
+    killed = NodeReport.cut_short(30, {"born": 1, "step": 20, "completed": 19})
+    of_nothing = NodeReport.of_nothing(30)  # it had nothing to tell, and did tell that
+    told = summarize("r", scenario, {**simulation.reports, 30: [killed, of_nothing]}, None)
+    assert told["unreported_lives"] == 1
+    assert "  without what 1 life counted that ended without a report\n" in shown(told)
+
+
 def test_latencies_between_machines_are_marked_with_what_their_clocks_may_differ_by() -> None:
     scenario = walk(steps=64, links={"delay": 0.002})
     simulation = Simulation(scenario)

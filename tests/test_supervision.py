@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -114,7 +115,7 @@ def test_ctrl_c_ends_the_run_cleanly(tmp_path: Path, timing: dict[str, Any]) -> 
     summary = result.summary
     assert summary["interrupted"]
     assert summary["failures"] == []
-    assert summary["lost"] == 0
+    assert (summary["lost"], summary["unreported_lives"]) == (0, 0)
     assert summary["messages"]["sent"] == summary["messages"]["recorded"]
     assert all(steps >= 20 for steps in summary["completed_steps"].values())
     with Recording.open(running.recording) as recording:
@@ -193,9 +194,13 @@ def test_a_node_that_dies_is_started_again_and_taken_back_in(tmp_path: Path, pac
     assert "node 2 died" in result.err
     assert "starting it again" in result.err
     summary = result.summary
-    assert summary["restarts"] == 1
+    assert (summary["restarts"], summary["unreported_lives"]) == (1, 1)
     assert summary["failures"] == []
     messages = running.messages()
+    first_life = [m for m in messages if "/node/2/" in m.topic and m.payload["born"] < born]
+    missing = Counter(m.topic.rpartition("/")[2] for m in first_life)
+    sent, on_file = Counter(summary["messages"]["sent"]), Counter(summary["messages"]["recorded"])
+    assert on_file - sent == missing, "what the life that was killed had sent"
     for neighbour in (1, 4):
         used = intermediates(messages, neighbour)
         assert everybody[neighbour] in [taken for step, taken in used.items() if step < born]

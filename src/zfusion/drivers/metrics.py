@@ -185,17 +185,22 @@ class NodeReport:
     """Neighbour -> what link emulation did with its messages here -> how often."""
     incidents: dict[str, int] = field(default_factory=dict)
     """What was out of the ordinary with the method -> how often."""
+    cut: bool = False
+    """Whether it ended without telling what it had counted: all counters are 0 then, whatever there was."""
 
     @classmethod
     def of_nothing(cls, node: NodeId) -> NodeReport:
         """Of a life that ended before its first step."""
-        return cls.cut_short(node, {"born": 0, "step": 0, "completed": 0})
+        return cls._uncounted(node, 0, 0, 0)
 
     @classmethod
     def cut_short(cls, node: NodeId, status: Mapping[str, Any]) -> NodeReport:
         """Of a life that ended without a report: what is known from the last `Status` that it told."""
-        born, step, completed = status["born"], status["step"], status["completed"]
-        return cls(node, born, step, completed, 0, 0.0, sent={}, edges={}, fallbacks=0, errors={}, latency={})
+        return cls._uncounted(node, status["born"], status["step"], status["completed"], cut=True)
+
+    @classmethod
+    def _uncounted(cls, node: NodeId, born: int, step: int, completed: int, *, cut: bool = False) -> NodeReport:
+        return cls(node, born, step, completed, 0, 0.0, sent={}, edges={}, fallbacks=0, errors={}, latency={}, cut=cut)
 
 
 def told_estimate(node: Node) -> dict[str, list[float]]:

@@ -79,7 +79,8 @@ def summarize(
 ) -> dict[str, Any]:
     """The summary as plain data: what ``--json`` prints.
 
-    run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, lost, late,
+    run, method, nodes, steps, completed_steps {node}, messages {sent, recorded: {stage: count}}, unreported_lives:
+    those that told no counters, being killed, so that all sums, as `sent`, lack what was theirs; lost, late,
     revised, too_late, stale (`EdgeCounters`), refused and incidents by name, clock_jumps and clock_offset_exceeded,
     rounds_per_s, latency_us {p50, p99} from measurement to estimate, settled: both for the second half of the steps,
     and cpu_us, what a step costs a node; rmse {stage: {node}} where the truth is known, predicted_rmse {stage: {node}},
@@ -101,6 +102,7 @@ def summarize(
         "completed_steps": {str(i): sum(r.completed for r in reports.get(i, ())) for i in scenario.ids},
         "messages": {"sent": dict(sent), "recorded": dict(recorder.recorded) if recorder else {}},
         **_counted(lives, edges, recorder),
+        "unreported_lives": sum(report.cut for report in lives),
         "restarts": sum(max(0, len(of_node) - 1) for of_node in reports.values()),
         "rounds_per_s": _rate((report.completed, report.elapsed_s) for report in lives),
         "latency_us": _quantiles(report.latency for report in lives),
@@ -326,7 +328,9 @@ def _table_of_errors(summary: Mapping[str, Any]) -> Table:
 def _show_traffic(console: Console, summary: Mapping[str, Any]) -> None:
     sent, recorded = summary["messages"]["sent"], summary["messages"]["recorded"]
     counts = ", ".join(f"{count} {stage}" for stage, count in sent.items())
-    console.print(f"sent: {counts}")
+    console.print(f"sent: {counts or 'nothing is known'}")
+    if lives := summary["unreported_lives"]:
+        console.print(f"  without what {lives} {'life' if lives == 1 else 'lives'} counted that ended without a report")
     if recorded:
         missing = sum(summary["lost_on_recording"].values())
         console.print(f"recorded: {sum(recorded.values())} messages, {missing} missing")
