@@ -6,8 +6,8 @@ import os
 import signal
 from pathlib import Path
 
-from swarms import Command, process_of, run_name, variant
-from test_supervision import ENDLESS, swarm
+from swarms import Command, process_of, run_name, variant, wait_until
+from test_supervision import ENDLESS, NODES, swarm
 from zfusion import keys
 from zfusion.drivers.settings import LEASE_MS
 from zfusion.recording import Recording
@@ -38,6 +38,31 @@ def test_a_recorder_that_stands_still_does_not_hold_up_a_paced_swarm(tmp_path: P
         assert recording.statistics is not None
         gaps = recording.statistics[keys.stage_key(running.run, 1, "measurement")]
     assert gaps.lost_between > 0
+
+
+def test_a_recorder_that_stands_still_longer_than_links_are_kept_misses_what_a_free_running_swarm_says(
+    tmp_path: Path,
+) -> None:
+    """Senders wait for it, until its links are given up."""
+    with swarm(tmp_path, "--steps", ENDLESS, "--free-run") as running:
+        logs = [tmp_path / f"{running.run}.logs" / f"node-{node}.log" for node in NODES]
+        running.wait_for(1, 20)
+        recorder = process_of(running.run, "record")
+        os.kill(recorder, signal.SIGSTOP)
+        gone, there = "the recorder is gone", "the recorder is there"
+        wait_until(lambda: all(gone in log.read_text() for log in logs), "its links are given up")
+        running.wait_for(1, running.step(1) + 20)
+        os.kill(recorder, signal.SIGCONT)
+        wait_until(lambda: all(there in log.read_text().partition(gone)[2] for log in logs), "it is back")
+        running.wait_for(1, running.step(1) + 20)
+        running.command.interrupt()
+        result = running.command.wait()
+    assert result.code == 0, result.err
+    summary = result.summary
+    assert summary["failures"] == []
+    missing = sum(summary["messages"]["sent"].values()) - sum(summary["messages"]["recorded"].values())
+    assert sum(summary["lost_on_recording"].values()) == missing > 0
+    assert (summary["recorder"]["unrecorded"], summary["recorder"]["overrun"]) == (0, 0)
 
 
 def test_a_swarm_whose_recording_has_no_more_room_runs_to_its_end(tmp_path: Path) -> None:
