@@ -175,5 +175,6 @@ def test_the_line_of_another_process_can_be_joined_after_the_clock_was_set() -> 
     for _ in range(3):
         assert new.now() == old.now()
         assert new.of_machine(machine.wall) == new.now()
+        assert new.on_machine(new.now()) == machine.wall
         machine.goes_on(SECOND, 1e-4)
         assert new.look() is old.look() is None
