@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from random import Random
@@ -10,7 +13,7 @@ from random import Random
 import msgpack
 import pytest
 
-from recordings import START_NS, open_writer, read, read_plainly, record, traffic
+from recordings import START_NS, contents, open_writer, read, read_plainly, record, traffic
 from simulations import record as record_simulation
 from simulations import records
 from swarms import zfusion
@@ -132,6 +135,38 @@ def test_what_is_missing_of_a_part_is_told_by_the_whole(tmp_path: Path) -> None:
         assert recording.note.startswith("broken.mcap: broken off: it holds 50 messages")
 
 
+def test_parts_that_are_all_of_a_recording_are_complete(tmp_path: Path) -> None:
+    sent = traffic(30)
+    path = record(tmp_path / "r.mcap", sent)
+    a, b, c, one, other = (tmp_path / f"{name}.mcap" for name in ("a", "b", "c", "one", "other"))
+    for output, steps in ((a, range(1, 20)), (b, range(10, 31)), (c, range(22, 31))):
+        cut(path, output, steps=steps)
+    cut(path, one, nodes=["1"])
+    cut(path, other, nodes=["2"])
+    for sources, complete in (
+        ([a, b], True),
+        ([one, other], True),
+        ([path, b], True),
+        ([a, c], False),
+        ([a, one], False),
+        ([b], False),
+    ):
+        merge(sources, tmp_path / "m.mcap")
+        with Recording.open(tmp_path / "m.mcap") as recording:
+            assert (recording.complete, not recording.note) == (complete, complete), sources
+            assert complete is (sorted(contents(recording)) == sorted(sent))
+
+
+def test_parts_of_what_is_a_part_are_not_complete(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", traffic(30))
+    cut(path, tmp_path / "half.mcap", steps=range(1, 16))
+    for name, steps in (("a", range(1, 9)), ("b", range(5, 16))):
+        cut(tmp_path / "half.mcap", tmp_path / f"{name}.mcap", steps=steps)
+    merge([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "m.mcap")
+    with Recording.open(tmp_path / "m.mcap") as recording:
+        assert not recording.complete
+
+
 # --- cut --------------------------------------------------------------------------------------------------------
 
 
@@ -216,6 +251,28 @@ def test_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
         del sent
         peaks.append(peak_memory(lambda path=path: both(path)))  # type: ignore[misc]
     assert peaks[1] < peaks[0] + 2_000_000
+
+
+STOPPED_IN_THE_MIDDLE = """
+import os, sys
+from zfusion.cli import run
+from zfusion.recording.derived import DerivedWriter
+
+number = int(sys.argv.pop(1))
+DerivedWriter.add = lambda *_: os.kill(os.getpid(), number)
+run()
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "number"), [("recover", signal.SIGTERM), ("merge", signal.SIGHUP), ("cut", signal.SIGINT)]
+)
+def test_who_is_stopped_in_the_middle_leaves_nothing(tmp_path: Path, command: str, number: signal.Signals) -> None:
+    record(tmp_path / "r.mcap", traffic(20))
+    arguments = [sys.executable, "-c", STOPPED_IN_THE_MIDDLE, str(int(number)), command, "r.mcap", "-o", "o.mcap"]
+    done = subprocess.run(arguments, cwd=tmp_path, timeout=90, check=False)
+    assert done.returncode == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 
 
 def test_the_commands(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -30,6 +32,7 @@ from zfusion import keys
 from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import decode_any, encode
 from zfusion.recording import GapCounter, Gaps, Keeping, Record, Recording, arithmetic_differences, layout
+from zfusion.recording import export as export_module
 from zfusion.recording.export import FORMATS, export
 from zfusion.recording.info import info
 from zfusion.recording.layout import CHECKSUM, RECORDING, SCENARIO, sealed, segment_path
@@ -634,6 +637,38 @@ def test_no_export_replaces_what_it_reads(tmp_path: Path) -> None:
             with Recording.open(source) as recording, pytest.raises(InputError, match="is one of the recordings"):
                 export(recording, target, name)
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize(
+    ("felled_by", "expected"),
+    [(KeyboardInterrupt(), KeyboardInterrupt), (OSError(errno.ENOSPC, "No space left on device"), RunError)],
+)
+def test_an_export_that_ends_in_the_middle_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, felled_by: BaseException, expected: type[BaseException]
+) -> None:
+    numbers = count()
+
+    def fail_at_ten(data: bytes) -> dict[str, Any]:
+        if next(numbers) == 10:
+            raise felled_by
+        return decode_any(data)
+
+    monkeypatch.setattr(export_module, "decode_any", fail_at_ten)
+    (tmp_path / "out").write_text("of before")
+    with Recording.open(record(tmp_path / "r.mcap", traffic(20))) as recording, pytest.raises(expected):
+        export(recording, tmp_path / "out", name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "r.mcap"]
+    assert (tmp_path / "out").read_text() == "of before"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
+def test_an_export_onto_a_full_device_fails(tmp_path: Path) -> None:
+    with Recording.open(record(tmp_path / "r.mcap", traffic(20))) as recording:
+        for name in FORMATS:
+            with pytest.raises(RunError, match="/dev/full: writing failed: No space left"):
+                export(recording, "/dev/full", name)
+    assert Path("/dev/full").is_char_device()
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")

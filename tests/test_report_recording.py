@@ -17,7 +17,7 @@ from simulations import MS, by_rule, four_sensor, walk
 from zfusion import keys
 from zfusion.cli import app
 from zfusion.drivers.simulated import simulate
-from zfusion.errors import InputError, RecordingError
+from zfusion.errors import InputError, RecordingError, RunError
 from zfusion.messages import encode
 from zfusion.model.scenario import Scenario
 from zfusion.recording import Recording, RecordingWriter
@@ -252,6 +252,9 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
         write_report(Path(__file__), tmp_path / "r.html")
     with pytest.raises(InputError, match="is one of the recordings that are read"):
         write_report(SAMPLE, SAMPLE)
+    if Path("/dev/full").exists():
+        with pytest.raises(RunError, match="/dev/full: writing failed: No space left"):
+            write_report(SAMPLE, Path("/dev/full"))
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         write_report(SAMPLE, tmp_path / "file" / "r.html")

@@ -200,6 +200,13 @@ def on_signals(stop: Callable[[], None]) -> None:
         signal.signal(number, lambda *_: stop())
 
 
+def interrupted_by_signals() -> None:
+    """Have a signal that wants this process to end do what Ctrl-C does: what is half done is cleared away first."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
+
+
 def control_of(descriptor: int | None, *, deadly: bool) -> Any:
     """The line to the launcher, in a process that one started."""
     if descriptor is None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import signal
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zfusion.cli.common import Json, err, finish, out
+from zfusion.cli.common import Json, err, finish, interrupted_by_signals, out
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="FILE", help="Experiment file (TOML).", show_default=False)]
 Directory = Annotated[Path, typer.Option("--output", "-o", help="Directory for runs, tables and report.")]
@@ -44,7 +43,7 @@ def experiment(
     planned = plan(load_experiment(file, small=small))
     recordings = output.absolute() / "recordings" if record else None
     engine = engine_of(planned.experiment.spec.world, jobs or os.cpu_count() or 1, dask, recordings)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    interrupted_by_signals()
     with ProgressBar(err, planned.experiment.name, enabled=not as_json) as bar:
         outcome = run_experiment(planned, output, engine, bar)
         report = None if no_report or not outcome.tables else write_report(output)

@@ -22,6 +22,7 @@ from zfusion.cli.common import (
     Seed,
     err,
     finish,
+    interrupted_by_signals,
     load,
     on_signals,
     out,
@@ -218,6 +219,7 @@ def export(
     from zfusion.recording import Recording
     from zfusion.recording.export import export as write
 
+    interrupted_by_signals()
     target = output or recording.with_suffix(f".{format}")
     with Recording.open(recording) as opened:
         done = write(opened, target, format, topics=topic)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from zfusion.cli.common import Json, RecordingFile, finish, out, steps_range
+from zfusion.cli.common import Json, RecordingFile, finish, interrupted_by_signals, out, steps_range
 from zfusion.cli.progress import progress
 
 Made = Annotated[Path, typer.Option("--output", "-o", help="Recording to write.", show_default=False)]
@@ -19,6 +19,7 @@ def recover(recording: RecordingFile, output: Made, as_json: Json = False) -> No
     from zfusion.report.recording import show_recovery
 
     size = recording.stat().st_size if recording.is_file() else 0
+    interrupted_by_signals()
     with progress("recovering", 2 * size) as advance:
         told = save(recording, output, advance)
     finish(told.as_dict(), as_json, lambda: show_recovery(out, told))
@@ -35,6 +36,7 @@ def merge(
     from zfusion.recording.merge import merge as put_together
     from zfusion.report.recording import show_merged
 
+    interrupted_by_signals()
     with progress("merging", None) as advance:
         told = put_together(recordings, output, advance)
     finish(told.as_dict(), as_json, lambda: show_merged(out, told))
@@ -54,6 +56,7 @@ def cut(
     from zfusion.report.recording import show_cut
 
     chosen = None if nodes is None else [node.strip() for node in nodes.split(",")]
+    interrupted_by_signals()
     with progress("cutting", None) as advance:
         told = copy(recording, output, steps=steps_range(steps), nodes=chosen, advance=advance)
     finish(told.as_dict(), as_json, lambda: show_cut(out, told))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from zfusion.cli.common import Json, err, finish, out, steps_range
+from zfusion.cli.common import Json, err, finish, interrupted_by_signals, out, steps_range
 
 
 def report(
@@ -31,6 +31,7 @@ def report(
     from zfusion.report.extras import check_extras
 
     check_extras()
+    interrupted_by_signals()
     pictures: Path | None
     if source.is_dir():
         if steps is not None or figures is not None:

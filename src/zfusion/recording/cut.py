@@ -10,6 +10,7 @@ from typing import Any
 from zfusion import keys
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import read_stamp
+from zfusion.recording import layout
 from zfusion.recording.derived import OF_ITS_PLACE, DerivedWriter
 from zfusion.recording.merge import EVERY
 from zfusion.recording.reader import Recording
@@ -83,8 +84,16 @@ def cut(
             within = {
                 topic: replace(gaps, lost_before=0, lost_after=0) for topic, gaps in writer.accounts.gaps().items()
             }
-            writer.finish("cut", recording.files, note, told.as_dict(), statistics=within)
+            whole = _whole(recording)
+            writer.finish("cut", recording.files, note, told.as_dict(), statistics=within, of=whole)
     return told
+
+
+def _whole(recording: Recording) -> dict[str, str]:
+    """What says of which recording this is a part and how much that is, so that parts can be known to be all of it."""
+    if not recording.complete or layout.IDENTITY not in recording.metadata:
+        return {}
+    return {layout.CUT_FROM: recording.metadata[layout.IDENTITY], layout.OF_MESSAGES: str(recording.messages)}
 
 
 TRUTH = ""

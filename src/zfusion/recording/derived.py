@@ -16,11 +16,8 @@ from zfusion.recording import layout
 from zfusion.recording.accounts import Accounts, to_state
 from zfusion.recording.channels import Describe
 from zfusion.recording.file import Record
-from zfusion.recording.paths import refuse_to_replace
+from zfusion.recording.paths import PART, refuse_to_replace
 from zfusion.recording.segment import SegmentWriter
-
-PART = ".part"
-"""Ends the name of a file that is not finished yet."""
 
 OF_ITS_PLACE = (layout.IDENTITY, layout.SEGMENT, layout.PREVIOUS)
 """Facts of a file that tell its place among segments."""
@@ -75,10 +72,11 @@ class DerivedWriter:
         *,
         statistics: Mapping[str, Gaps],
         closing: Mapping[str, str] | None = None,
+        of: Mapping[str, str] | None = None,
     ) -> None:
-        """Close the file, that is now there: what it is (recovered, merged, cut), and what is not on it."""
+        """Close the file, that is now there: what it is (recovered, merged, cut), what is not on it, what it is of."""
         names = json.dumps([path.name for path in sources])
-        derived = {"kind": kind, "sources": names, "note": note, "account": json.dumps(account)}
+        derived = {"kind": kind, "sources": names, "note": note, "account": json.dumps(account)} | dict(of or {})
         end = dict(closing or {"messages": str(self.messages)}) | {layout.IN_SEGMENT: str(self.messages)}
         with self._segment.claimed():
             self._segment.finish({layout.DERIVED: derived, layout.STATISTICS: to_state(statistics), layout.CLOSE: end})

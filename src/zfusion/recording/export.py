@@ -23,7 +23,7 @@ import numpy as np
 from zfusion import keys
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import decode_any
-from zfusion.recording.paths import refuse_to_replace
+from zfusion.recording.paths import refuse_to_replace, written_whole
 from zfusion.recording.reader import Recording
 from zfusion.stages import BUILT_IN, HEADER, Kind, Stage
 
@@ -69,7 +69,8 @@ def export(
     """Write the messages of `recording`, or those chosen as in `Recording.records`, to `target`; replaces it.
 
     `stages` are the method's beside the built-in ones: they say which fields are matrices. InputError for a format
-    that is not one of `FORMATS`, if `target` is the recording itself, and if it cannot be written.
+    that is not one of `FORMATS`, if `target` is the recording itself, and if it cannot be written; RunError if not to
+    its end: nothing is left of it then.
     """
     if format not in FORMATS:
         raise InputError(f"export format {format!r}: expected one of {', '.join(FORMATS)}")
@@ -81,10 +82,8 @@ def export(
         for field in stage.fields
         if field.kind is Kind.MATRIX
     }
-    try:
-        left_out = FORMATS[format](source, Path(target), matrices)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+    with written_whole(Path(target)) as half:
+        left_out = FORMATS[format](source, half, matrices)
     return Exported(source.messages, source.unreadable, left_out)
 
 

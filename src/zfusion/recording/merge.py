@@ -12,6 +12,7 @@ from typing import Any
 
 from zfusion.errors import InputError, MessageError
 from zfusion.messages import read_stamp
+from zfusion.recording import layout
 from zfusion.recording.channels import Description
 from zfusion.recording.derived import OF_ITS_PLACE, DerivedWriter
 from zfusion.recording.reader import Record, Recording
@@ -121,9 +122,23 @@ def merge(sources: Sequence[Path], output: Path, advance: Callable[[int], None] 
                 conflicting=tuple(conflicting)[:NAMED],
                 still_twice=sum(gaps.duplicates for gaps in writer.accounts.gaps().values()),
             )
-            note = "; ".join(f"{r.path.name}: {r.note}" for r in recordings if r.note)
+            lacking = () if _is_whole(recordings, writer.messages) else (r for r in recordings if r.note)
+            note = "; ".join(f"{r.path.name}: {r.note}" for r in lacking)
             writer.finish("merged", files, note, told.as_dict(), statistics=statistics)
     return told
+
+
+def _is_whole(recordings: Sequence[Recording], messages: int) -> bool:
+    """Whether nothing is missing, whatever the recordings say of themselves.
+
+    What is on one of them that is complete is all there. And parts of one complete recording that have together as many
+    different messages as that has are all of it.
+    """
+    if any(recording.complete for recording in recordings):
+        return True
+    facts = {tuple(map(recording.derived.get, (layout.CUT_FROM, layout.OF_MESSAGES))) for recording in recordings}
+    origin, of = facts.pop()
+    return not facts and origin is not None and of == str(messages)
 
 
 def _copy(

@@ -1,15 +1,19 @@
-"""Files that are read and files that are written: what is read is a file, and nothing that is read is replaced."""
+"""Files that are read and written: what is read is a file and is not replaced, what is written is there as a whole."""
 
 from __future__ import annotations
 
 import errno
 import os
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from zfusion.errors import InputError
+from zfusion.errors import InputError, RunError
+
+PART = ".part"
+"""Ends the name of a file that is not finished yet."""
 
 
 def open_to_read(path: Path) -> BinaryIO:
@@ -33,3 +37,31 @@ def refuse_to_replace(output: Path, inputs: Iterable[Path], what: str = "one of 
     for path in inputs:
         if output.exists() and path.exists() and output.samefile(path):
             raise InputError(f"{output}: is {what}")
+
+
+@contextmanager
+def written_whole(output: Path) -> Iterator[Path]:
+    """Where to write what is the file `output` in the end; that is not touched before all of it is there.
+
+    InputError if nothing can be written there; RunError if writing fails, on a full disk. Then, and after any other
+    error, nothing is left of it. What is no file but a pipe or a device is written as it goes.
+    """
+    if output.is_dir():
+        raise InputError(f"{output}: cannot be written: {os.strerror(errno.EISDIR)}")
+    file = output.resolve()
+    as_it_goes = output.exists() and not output.is_file()
+    half = output if as_it_goes else file.with_name(file.name + PART)
+    try:
+        half.touch()
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written: {error.strerror}") from None
+    try:
+        yield half
+        if not as_it_goes:
+            half.replace(file)
+    except BaseException as error:
+        if not as_it_goes:
+            half.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise RunError(f"{output}: writing failed: {error.strerror}") from error
+        raise

@@ -10,7 +10,8 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from zfusion.errors import InputError
+from zfusion.errors import InputError, RunError
+from zfusion.recording.paths import written_whole
 from zfusion.report.figures.style import Picture
 
 TEMPLATE = "report.html.j2"
@@ -77,21 +78,31 @@ class Page:
         return environment.get_template(TEMPLATE).render(page=self, version=version("zfusion"))
 
     def write(self, path: Path) -> Path:
-        """Write the page to a file, whole or not at all; its path. InputError if it cannot be written."""
+        """Write the page to a file, whole or not at all; its path.
+
+        InputError if nothing can be written there, RunError if not all of it can.
+        """
         text = self.render()
-        half = path.with_name(path.name + ".part")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        _make(path.parent)
+        with written_whole(path) as half:
             half.write_text(text, encoding="utf-8")
-            half.replace(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         return path
 
 
 def save_pictures(page: Page, directory: Path) -> list[Path]:
-    """Write all pictures of a page as SVG and PNG; their paths. InputError if they cannot be written."""
+    """Write all pictures of a page as SVG and PNG; their paths.
+
+    InputError if there can be no such directory, RunError if not all of them can be written.
+    """
+    _make(directory)
     try:
         return [path for picture in page.pictures for path in picture.save(directory)]
+    except OSError as error:
+        raise RunError(f"{directory}: writing failed: {error.strerror}") from None
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{directory}: cannot be written: {error.strerror}") from None
