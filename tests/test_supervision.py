@@ -235,6 +235,20 @@ def test_nodes_that_all_die_at_once_go_on_together(tmp_path: Path) -> None:
     assert verdict.summary["different"] == 0
 
 
+def test_nodes_that_are_all_killed_by_plan_come_back_together(tmp_path: Path) -> None:
+    faults = [{"kind": "kill", "node": int(node), "step": 30, "restart_after": 60} for node in NODES]
+    scenario = variant(tmp_path, faults=faults, **PACED)
+    result = launch(tmp_path, scenario, "--steps", 600, "--record", "r.mcap")
+    assert result.code == 0, result.err
+    summary = result.summary
+    assert (summary["failures"], summary["restarts"], summary["unreported_lives"]) == ([], 4, 0)
+    born = {
+        m.payload["node"]: m.payload["born"] for m in recorded(tmp_path / "r.mcap") if m.topic.endswith("/estimate")
+    }
+    assert all(step > 90 for step in born.values())
+    assert zfusion(tmp_path, "replay", "r.mcap", "--verify", "--json").code == 0
+
+
 def test_a_run_without_times_has_failed_when_all_its_nodes_die_at_once(tmp_path: Path) -> None:
     with swarm(tmp_path, "--steps", ENDLESS, "--restart", "--free-run") as running:
         running.wait_for(2, 20)

@@ -177,7 +177,7 @@ class Launcher:
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
-        while any(child.running for child in self._nodes.values()):
+        while self._goes_on():
             self._look_after_all()
             self._give_up_stopped()
             self._help_who_finds_nobody()
@@ -191,6 +191,16 @@ class Launcher:
                 stuck = [child.name for child in self._nodes.values() if child.running]
                 self._failures.append(f"{', '.join(stuck)}: did not stop within {STOP_S:g} s and had to be killed")
                 return
+
+    def _goes_on(self) -> bool:
+        """Whether a node's process runs; or all were felled by plan, and some return at a time before the last step."""
+        nodes = self._nodes.values()
+        if any(child.running for child in nodes):
+            return True
+        if self._stop_by is not None or any(child.exit_code == 0 for child in nodes):
+            return False
+        blows = [child.blow for child in nodes if child.blow is not None and child.blow["until_ns"] is not None]
+        return any(blow["until_step"] <= self._scenario.steps for blow in blows)
 
     def _help_who_finds_nobody(self) -> None:
         """Have nodes end, or begin together, that would wait for ever for those that they are to join."""
