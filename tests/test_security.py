@@ -41,7 +41,7 @@ def strangers(directory: Path, out: Path) -> dict[str, dict[str, Any] | None]:
     other.mkdir()
     certificate, key = make_authority("zfusion", 10)
     (other / "ca.pem").write_bytes(certificate)
-    (other / "ca.key").write_bytes(key)
+    write_private(other / "ca.key", key)
     expired = stolen(directory / "expired", out / "ca", "node-2", 1, timedelta(days=2))
     foreign = stolen(directory / "foreign", other, "node-2", 10)
     return {
