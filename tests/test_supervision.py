@@ -235,6 +235,20 @@ def test_nodes_that_all_die_at_once_go_on_together(tmp_path: Path) -> None:
     assert verdict.summary["different"] == 0
 
 
+def test_a_node_that_is_alone_goes_on_with_the_step_that_is_due(tmp_path: Path) -> None:
+    network = {"matrix": [[int(i == j) for j in range(4)] for i in range(4)]}
+    with swarm(tmp_path, "--steps", ENDLESS, "--restart", network=network, **PACED) as running:
+        running.wait_for(2, 20)
+        os.kill(process_of(running.run, "--id", "2"), signal.SIGKILL)
+        wait_until(lambda: running.last(2)["born"] > 20, f"node 2 has gone on\n{running.command.said()}")
+        running.command.interrupt()
+        assert running.command.wait().code == 0
+    messages = [m.payload for m in recorded(running.recording) if m.topic.endswith("/node/2/estimate")]
+    steps = [m["step"] for m in messages]
+    assert steps == sorted(set(steps))
+    assert len({m["born"] for m in messages}) == 2
+
+
 def test_nodes_that_are_all_killed_by_plan_come_back_together(tmp_path: Path) -> None:
     faults = [{"kind": "kill", "node": int(node), "step": 30, "restart_after": 60} for node in NODES]
     scenario = variant(tmp_path, faults=faults, **PACED)

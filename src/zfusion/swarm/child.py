@@ -58,13 +58,16 @@ class Child:
         """Whether its process has been started and not been seen to end."""
         return self.process is not None and self.exit_code is None
 
-    def start(self, entrance: Sequence[str] = ()) -> LauncherEnd:
-        """Start its process, or start it again; `entrance` are the words that have it run in its namespace."""
+    def start(self, entrance: Sequence[str] = (), more: Sequence[str] = ()) -> LauncherEnd:
+        """Start its process, or start it again, with `more` words after its command.
+
+        `entrance` are those before it that have it run in its namespace.
+        """
         line = self.line = LauncherEnd()
         number = line.child.fileno()
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [*entrance, *self.command, "--control-fd", str(number)],
+                [*entrance, *self.command, *more, "--control-fd", str(number)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

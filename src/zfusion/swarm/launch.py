@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,16 @@ class Launcher:
         entrance: Sequence[str] = ()
         if self._network is not None and child is not self._network:
             entrance = self._network.status["enter"][child.place]
-        self._selector.register(child.start(entrance).socket, selectors.EVENT_READ, child)
+        line = child.start(entrance, self._where_it_was(child))
+        self._selector.register(line.socket, selectors.EVENT_READ, child)
+
+    def _where_it_was(self, child: Child) -> Sequence[str]:
+        """What has a node of paced steps, started again, go on with the one that is due where no other can tell it."""
+        alone = child.node is not None and frozenset({child.node}) in self._parts
+        if not alone or child.epoch_ns is None or self._scenario.timing.period_ns is None:
+            return ()
+        epoch_s = self._clock.on_machine(child.epoch_ns) / 1e9
+        return "--epoch", datetime.fromtimestamp(epoch_s, UTC).isoformat()
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
