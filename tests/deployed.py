@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import tomli_w
 import zenoh
 
 from namespaces import Hosts
-from swarms import ZFUSION, Command, run_name, variant
+from swarms import ZFUSION, Command, Recorded, run_name, variant
 from zfusion.deploy.folders import write
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan, Process
@@ -148,6 +148,22 @@ def swarm(plan: Plan, out: Path, hosts: Hosts | None = None) -> Iterator[Swarm]:
                 assert command.wait().code == 0, command.said()
     finally:
         running.kill()
+
+
+def refusals(reports: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, int]]:
+    """(node's process, neighbour) -> what the node has refused of it, by reason; where that is anything."""
+    return {
+        (name, other): edge["refused"]
+        for name, report in reports.items()
+        if name.startswith("node")
+        for other, edge in report["edges"].items()
+        if edge["refused"]
+    }
+
+
+def senders(messages: Iterable[Recorded]) -> set[tuple[str, str]]:
+    """(node whose key it is, node that says that it has sent) of recorded messages."""
+    return {(m.topic.split("/")[3], str(m.payload["node"])) for m in messages if "/node/" in m.topic}
 
 
 def tls_files(folder: Path, name: str, ca: Path | None = None) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from deployed import deployed, hosts_document, process, swarm
+from deployed import deployed, hosts_document, process, refusals, senders, swarm
 from swarms import Listener, client, decoded, endpoints, estimates, recorded, wait_until, zfusion
 from test_hostile import Attack, attacked, header, intermediates, measurements, nonsense, pack
 from test_security import Doors
@@ -144,10 +144,13 @@ class Rates:
     after: float
 
     def tell(self) -> None:
+        def share(whole: float) -> str:
+            return f"{self.during / whole:.2f}" if whole else "of nothing"  # few lies are told before a step is made
+
         print(
-            f"rounds a second: {self.during:.0f} meanwhile; {self.before:.0f} before ({self.during / self.before:.2f}),"
+            f"rounds a second: {self.during:.0f} meanwhile; {self.before:.0f} before ({share(self.before)}),"
             f" {self.after:.0f} after; beside as many messages that nobody hears {self.beside:.0f}"
-            f" ({self.during / self.beside:.2f})"
+            f" ({share(self.beside)})"
         )
 
 
@@ -194,13 +197,9 @@ def flooded(plan: Plan, out: Path, number: int) -> tuple[Rates, dict[str, dict[s
         watch = Watch(links.enter_context(doors.as_member("observer", 3)), plan.run, 3)
         watch.wait_for(SETTLED)
         before = watch.calm(number)
-
-        def at(session: zenoh.Session) -> Callable[[str, bytes], object]:
-            block = zenoh.CongestionControl.BLOCK
-            return lambda key, data: session.put(f"zfusion/{plan.run}/{key}", data, congestion_control=block)
-
         with ExitStack() as liar:
-            puts = [at(liar.enter_context(doors.as_member("node-1", node))) for node in NODES]
+            sessions = [liar.enter_context(doors.as_member("node-1", node)) for node in NODES]
+            puts = [Attack(session, plan.run).put for session in sessions]
             beside = watch.rate(lambda: pour(puts, number, "elsewhere/"))
             during = watch.rate(lambda: pour(puts, number))
         rates = Rates(before, beside, during, watch.calm(number))
@@ -214,18 +213,11 @@ def endure_member(directory: Path, number: int) -> None:
     print(f"{number} lies on each of {len(NODES) * len(STAGES) + 1} keys at each of {len(NODES)} nodes")
     rates.tell()
     nodes = {name: report for name, report in reports.items() if name.startswith("node")}
-    refused = {
-        (name, other): sum(edge["refused"].values())
-        for name, report in nodes.items()
-        for other, edge in report["edges"].items()
-        if edge["refused"]
-    }
+    refused = {edge: sum(counted.values()) for edge, counted in refusals(reports).items()}
     # What comes in node 1's own name has to be read by those that hear it; everything else is kept from all by rules.
     assert refused == {("node-3", "1"): 2 * number, ("node-4", "1"): 2 * number}
     path = directory / "out" / process(plan, "recorder").host / "recordings" / f"{plan.run}.mcap"
-    messages = recorded(path)
-    owners = {(m.topic.split("/")[3], str(m.payload["node"])) for m in messages if "/node/" in m.topic}
-    assert owners == {(str(node), str(node)) for node in NODES}
+    assert senders(recorded(path)) == {(str(node), str(node)) for node in NODES}
     same_as_calm(directory, "field.toml", path, min(report["completed"] for report in nodes.values()))
 
 

@@ -12,7 +12,7 @@ import msgpack
 import pytest
 import zenoh
 
-from deployed import Swarm, answers, deployed, hosts_document, intruder, process, swarm, tls_files
+from deployed import Swarm, answers, deployed, hosts_document, intruder, process, refusals, senders, swarm, tls_files
 from swarms import Listener, recorded, wait_until, zfusion
 from zfusion import keys
 from zfusion.deploy.authority import make_authority, read_authority
@@ -151,10 +151,7 @@ def recording_is_honest(directory: Path, plan: Plan, running: Swarm, forged: lis
     messages = recorded(running.recording)
     assert {m.topic.split("/")[1] for m in messages} == {plan.run}
     assert [m.topic for m in messages if m.data == FORGED] == forged
-    owners = {
-        (m.topic.split("/")[3], str(m.payload["node"])) for m in messages if "/node/" in m.topic and m.data != FORGED
-    }
-    assert owners == {(node, node) for node in ("1", "2", "3", "4")}
+    assert senders(m for m in messages if m.data != FORGED) == {(node, node) for node in ("1", "2", "3", "4")}
     verdict = zfusion(directory, "replay", running.recording, "--verify", "--json")
     assert verdict.code == 0, verdict.err
 
@@ -180,13 +177,7 @@ def test_nobody_uninvited(tmp_path: Path, topology: str) -> None:
         observer_sees_who_is_there(plan, running)
         running.interrupt()
         reports = running.ended()
-    refused = {
-        (name, other): edge["refused"]
-        for name, report in reports.items()
-        if name.startswith("node")
-        for other, edge in report["edges"].items()
-        if edge["refused"]
-    }
+    refused = refusals(reports)
     # What node 1 says on its own keys a router passes on to all that hear it, and to the recorder.
     routed = topology == "router"
     assert set(refused) == {(name, "1") for name in (("node-3", "node-4") if routed else ("node-4",))}

@@ -101,16 +101,9 @@ def prober(endpoints: Endpoints, config_file: Path | None = None) -> Prober:
 
 def may_ask(key: str, config_file: Path | None) -> bool:
     """Whether the rules in a session's configuration let it ask about a key; InputError where it is none."""
-    rules = _setting(_config(Endpoints(), config_file), "access_control")
-    if not rules["enabled"]:
-        return True
-    exceptions = {
-        rule["permission"]
-        for rule in rules["rules"] or ()
-        if "query" in rule["messages"] and "egress" in (rule["flows"] or ["egress"])
-        if any(zenoh.KeyExpr(about).includes(zenoh.KeyExpr(key)) for about in rule["key_exprs"])
-    }
-    return "allow" in exceptions if rules["default_permission"] == "deny" else "deny" not in exceptions
+    default, exceptions = _permissions(config_file, "query")
+    excepted = any(zenoh.KeyExpr(about).includes(zenoh.KeyExpr(key)) for about in exceptions)
+    return excepted == (default == "deny")
 
 
 @contextmanager
@@ -146,14 +139,8 @@ def never_linger() -> None:
 
 def subscribable(config_file: Path) -> list[str] | None:
     """The key expressions that the rules of a configuration let its process subscribe to; None without such rules."""
-    rules = _setting(_base_config(config_file, "peer", low_latency=False), "access_control")
-    if not rules["enabled"] or rules["default_permission"] != "deny":
-        return None
-    allowed = (rule for rule in rules["rules"] or () if rule["permission"] == "allow")
-    reads = (
-        rule for rule in allowed if "declare_subscriber" in rule["messages"] and "egress" in (rule["flows"] or FLOWS)
-    )
-    return sorted({key for rule in reads for key in rule["key_exprs"]})
+    default, exceptions = _permissions(config_file, "declare_subscriber")
+    return sorted(exceptions) if default == "deny" else None
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
@@ -200,6 +187,16 @@ def _opened(config: zenoh.Config) -> zenoh.Session:
                 raise
         waiting.tell(time.monotonic_ns(), lambda: ["a router"])
         time.sleep(AGAIN_S)
+
+
+def _permissions(config_file: Path | None, message: str) -> tuple[str, set[str]]:
+    """What the rules of a configuration say of sending such a message: by default, and on which keys the contrary."""
+    rules = _setting(_config(Endpoints(), config_file), "access_control")
+    if not rules["enabled"]:
+        return "allow", set()
+    contrary = (rule for rule in rules["rules"] or () if rule["permission"] != rules["default_permission"])
+    about = (rule for rule in contrary if message in rule["messages"] and "egress" in (rule["flows"] or FLOWS))
+    return rules["default_permission"], {key for rule in about for key in rule["key_exprs"]}
 
 
 def _setting(config: zenoh.Config, path: str) -> Any:
