@@ -6,6 +6,7 @@ its covariance the one that it has: `oracles.brute_force` knows nothing of nodes
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
@@ -41,6 +42,27 @@ def said(path: Path) -> tuple[Scenario, dict[tuple[str, Life], dict[int, Payload
                 raw = decode_any(record.data)
                 found[stage, (raw["node"], raw["born"])].setdefault(raw["step"], raw)
     return scenario, found
+
+
+def assert_only_last_words_are_missing(verdict: Mapping[str, Any], path: Path) -> None:
+    """That what a replay missed is what nodes said when they were killed, all at once.
+
+    A message goes to each listener by itself. Its sender may be killed when it has come to a neighbour, and not to the
+    recorder; and where the neighbours are killed with it, nobody is left who could tell the recorder.
+    """
+    assert verdict["different"] == 0, verdict
+    missing = verdict["missing"]
+    assert len(missing) == verdict["missing_count"], verdict
+    assert missing or not verdict["unverifiable"], verdict
+    lives: dict[str, dict[int, int]] = defaultdict(dict)
+    for (_, (node, born)), messages in said(path)[1].items():
+        lives[str(node)][born] = max(*messages, lives[str(node)].get(born, 0))
+    for what in missing:
+        found = re.fullmatch(r"\w+ of node (\w+), step (\d+), which node \w+ used", what)
+        assert found, verdict
+        node, step = found[1], int(found[2])
+        _, last = max(((born, last) for born, last in lives[node].items() if born <= step), default=(1, 0))
+        assert last <= step, f"node {node} went on after step {step}: {what}"
 
 
 def used_sets(intermediates: Mapping[int, Payload], born: int) -> UsedSets:
