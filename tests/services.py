@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 import yaml
 
 from zfusion.deploy.compose import PLACE as IN_CONTAINER
 from zfusion.deploy.compose import write_compose
 from zfusion.deploy.folders import write
+from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
 from zfusion.deploy.systemd import PLACE, PROGRAM, write_units
+from zfusion.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
+
+EXAMPLE = ROOT / "examples" / "four_sensor.toml"
+
+
+def tool(name: str) -> str:
+    """The path of a program; the test is skipped, naming it, where it is not there."""
+    found = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
+    if found is None:
+        pytest.skip(f"{name} is not there")
+    return found
+
+
+def plan_of(hosts: Path, file: Path = EXAMPLE) -> Plan:
+    """The plan of a hosts file that names its run."""
+    scenario = load_scenario(file)
+    loaded = HostsFile.load(hosts, scenario)
+    assert loaded.run is not None
+    return Plan(scenario, loaded, loaded.run)
 
 
 @dataclass(frozen=True)

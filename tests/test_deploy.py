@@ -354,6 +354,20 @@ def test_data_files_go_where_they_are_needed(tmp_path: Path) -> None:
         write(plan, tmp_path / "again")
 
 
+def test_files_that_would_have_one_name_keep_their_own(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    for number, name in enumerate(("y-1.csv", "other/y-1.csv", "y-3.csv", "y-4.csv")):
+        (tmp_path / name).write_text(f"y\n{number}.5\n")
+    document = tomllib.loads(EXAMPLE.read_text())
+    document["source"] = {"kind": "csv", "file": "y-{id}.csv", "columns": ["y"]}
+    document["sensors"][1]["source"] = {"kind": "csv", "file": "other/y-1.csv", "columns": ["y"]}
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(document))
+    write(planned(tmp_path, hosts_document(), tmp_path / "s.toml"), tmp_path / "out")
+    loaded = load_scenario(tmp_path / "out" / "a" / "scenario.toml")
+    read = {i: Path(loaded.source_of(i).file).read_text() for i in (1, 2)}
+    assert read == {1: "y\n0.5\n", 2: "y\n1.5\n"}
+
+
 def test_a_design_is_made_once_for_all(tmp_path: Path) -> None:
     document = tomllib.loads((EXAMPLE.parent / "stationary.toml").read_text())
     ids = [sensor["id"] for sensor in document["sensors"]]

@@ -1,29 +1,24 @@
-"""Units, compose files, the image and the manifests: held against the tools that read them, and against the plan."""
+"""Units, compose files and the image: held against the tools that read them, and against the plan."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import jsonschema
-import kubernetes_validate
 import pytest
 import yaml
 
 from deployed import hosts_document, planned
-from services import ROOT, services_of, write_all
+from services import ROOT, plan_of, services_of, tool, write_all
 from zfusion.deploy.compose import SHARED
-from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
 from zfusion.deploy.systemd import SERVED
-from zfusion.model.scenario import load_scenario
 
 DEPLOY = ROOT / "deploy"
 
@@ -33,24 +28,7 @@ EXPOSURE = 2.0
 SYSTEMD_S_OWN = ("sysinit", "basic", "shutdown", "multi-user", "network-online", "time-sync")
 """Targets that units refer to."""
 
-KUBERNETES = ("1.31", "1.35")
-
 SCHEMA = json.loads((ROOT / "tests" / "schemas" / "compose-spec.json").read_text())
-
-
-def tool(name: str) -> str:
-    """The path of a program; the test is skipped, naming it, where it is not there."""
-    found = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
-    if found is None:
-        pytest.skip(f"{name} is not there")
-    return found
-
-
-def example_plan(hosts: Path) -> Plan:
-    scenario = load_scenario(ROOT / "examples" / "four_sensor.toml")
-    loaded = HostsFile.load(hosts, scenario)
-    assert loaded.run is not None
-    return Plan(scenario, loaded, loaded.run)
 
 
 @pytest.fixture(scope="module", params=["direct", "router"])
@@ -128,7 +106,7 @@ def test_services_are_the_plan_s(plan: tuple[Plan, Path], kind: str) -> None:
 
 
 def test_nothing_is_written_for_hosts_that_only_look(tmp_path: Path) -> None:
-    made = example_plan(DEPLOY / "hosts.example.toml")
+    made = plan_of(DEPLOY / "hosts.example.toml")
     write_all(made, tmp_path / "out")
     assert not (tmp_path / "out" / "desk" / "systemd").exists()
     assert not (tmp_path / "out" / "desk" / "compose.yaml").exists()
@@ -165,7 +143,7 @@ def test_containers_have_no_rights(plan: tuple[Plan, Path]) -> None:
 
 
 def test_the_compose_example_is_its_plan() -> None:
-    plan = example_plan(DEPLOY / "compose.hosts.toml")
+    plan = plan_of(DEPLOY / "compose.hosts.toml")
     document = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     services = document["services"]
     for process in plan.processes:
@@ -205,112 +183,6 @@ def test_the_image_s_recipe() -> None:
     assert wanted | {"examples"} == {
         line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")
     }
-
-
-@pytest.fixture(scope="module")
-def manifests(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    """What kustomize makes of deploy/kubernetes and of the folders that are deployed for it."""
-    place = tmp_path_factory.mktemp("kubernetes") / "kubernetes"
-    shutil.copytree(DEPLOY / "kubernetes", place, ignore=shutil.ignore_patterns("field"))
-    write_all(example_plan(place / "hosts.toml"), place / "field")
-    words = [tool("kubectl"), "kustomize", str(place)]
-    built = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60)
-    return list(yaml.safe_load_all(built.stdout))
-
-
-def of_kind(manifests: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
-    return {one["metadata"]["name"]: one for one in manifests if one["kind"] == kind}
-
-
-def pods(manifests: list[dict[str, Any]]) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
-    """Name of the set -> its pods and their one container."""
-    found = {}
-    for name, one in of_kind(manifests, "StatefulSet").items():
-        pod = one["spec"]["template"]["spec"]
-        (container,) = pod["containers"]
-        found[name] = pod, container
-    return found
-
-
-@pytest.mark.parametrize("version", KUBERNETES)
-def test_manifests_are_kubernetes_own(manifests: list[dict[str, Any]], version: str) -> None:
-    for manifest in manifests:
-        kubernetes_validate.validate(manifest, version, strict=True)
-
-
-def test_pods_run_what_is_planned(manifests: list[dict[str, Any]]) -> None:
-    plan = example_plan(DEPLOY / "kubernetes" / "hosts.toml")
-    nodes = of_kind(manifests, "StatefulSet")["zfusion-node"]["spec"]
-    ids = range(nodes["ordinals"]["start"], nodes["ordinals"]["start"] + nodes["replicas"])
-    assert list(ids) == list(plan.scenario.ids)
-    for process in plan.processes:
-        own = process.kind == "node"
-        _, container = pods(manifests)["zfusion-node" if own else "zfusion-recorder"]
-        words = [word.replace("$(NODE)", str(process.node)) for word in container["args"]]
-        given = [part for word in words for part in word.split("=", 1)]
-        planned = [word.replace("-o", "--output") if word == "-o" else word for word in plan.command(process)[1:]]
-        assert sorted(given) == sorted([*planned, *(["--forever"] if own else [])])
-        if own:
-            service = of_kind(manifests, "Service")[nodes["serviceName"]]["spec"]
-            assert plan.hosts.hosts[process.host].address == f"zfusion-node-{process.node}.{nodes['serviceName']}"
-            assert process.listen == (f"tls/0.0.0.0:{service['ports'][0]['port']}",)
-            assert container["ports"] == [{"name": service["ports"][0]["targetPort"], "containerPort": 7450}]
-
-
-def test_what_pods_refer_to_is_there(manifests: list[dict[str, Any]]) -> None:
-    maps, secrets = of_kind(manifests, "ConfigMap"), of_kind(manifests, "Secret")
-    for name, (pod, container) in pods(manifests).items():
-        claims = of_kind(manifests, "StatefulSet")[name]["spec"].get("volumeClaimTemplates", [])
-        assert {mount["name"] for mount in container["volumeMounts"]} == {
-            *(volume["name"] for volume in pod["volumes"]),
-            *(claim["metadata"]["name"] for claim in claims),
-        }
-        for volume in pod["volumes"]:
-            if "configMap" in volume:
-                assert volume["configMap"]["name"] in maps
-            if "secret" in volume:
-                assert {"ca.pem", "recorder.pem", "recorder.key"} == set(
-                    secrets[volume["secret"]["secretName"]]["data"]
-                )
-    (tls,) = [volume for volume in pods(manifests)["zfusion-node"][0]["volumes"] if volume["name"] == "tls"]
-    for i, source in enumerate(tls["projected"]["sources"], 1):
-        own = {"ca.pem", f"node-{i}.pem", f"node-{i}.key"}
-        assert set(secrets[source["secret"]["name"]]["data"]) == own
-        assert {(item["key"], item["path"]) for item in source["secret"]["items"]} == {(x, f"{i}/{x}") for x in own}
-    (mount,) = [m for m in pods(manifests)["zfusion-node"][1]["volumeMounts"] if m["name"] == "tls"]
-    assert mount["subPathExpr"] == "$(NODE)"
-    assert tls["projected"]["defaultMode"] == 0o440
-
-
-def test_pods_are_restricted(manifests: list[dict[str, Any]]) -> None:
-    (namespace,) = of_kind(manifests, "Namespace").values()
-    assert namespace["metadata"]["labels"]["pod-security.kubernetes.io/enforce"] == "restricted"
-    for pod, container in pods(manifests).values():
-        assert pod["securityContext"]["runAsNonRoot"] is True
-        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
-        assert pod["automountServiceAccountToken"] is False
-        assert container["securityContext"] == {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        }
-        assert {"startupProbe", "readinessProbe", "livenessProbe"} <= set(container)
-        assert re.fullmatch(r"zfusion:\d+\.\d+\.\d+", container["image"])
-
-
-def test_only_neighbours_are_let_in(manifests: list[dict[str, Any]]) -> None:
-    policies = of_kind(manifests, "NetworkPolicy")
-    (ingress,) = policies["zfusion-nodes"]["spec"]["ingress"]
-    assert ingress["ports"] == [{"protocol": "TCP", "port": 7450}]
-    assert "ingress" not in policies["zfusion-recorder"]["spec"]
-    labels = of_kind(manifests, "StatefulSet")["zfusion-node"]["spec"]["template"]["metadata"]["labels"]
-    selected = policies["zfusion-nodes"]["spec"]["podSelector"]["matchLabels"].items()
-    assert selected <= labels.items()
-    assert of_kind(manifests, "PodDisruptionBudget")["zfusion-nodes"]["spec"]["selector"]["matchLabels"].items() <= (
-        labels.items()
-    )
-    names = policies["zfusion-egress"]["spec"]["egress"][1]["to"][0]["podSelector"]
-    assert "matchLabels" not in names  # to which kustomize would add the swarm's own
 
 
 def test_commands_in_the_readme_are_there() -> None:

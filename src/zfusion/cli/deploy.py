@@ -24,6 +24,7 @@ def deploy(
     from zfusion.deploy.compose import write_compose
     from zfusion.deploy.folders import write
     from zfusion.deploy.hosts import HostsFile
+    from zfusion.deploy.kubernetes import write_component
     from zfusion.deploy.plan import Plan
     from zfusion.deploy.systemd import write_units
     from zfusion.keys import check_run
@@ -34,7 +35,7 @@ def deploy(
         Plan(loaded, placed, check_run(placed.run or scenario.stem)),
         output,
         renew=renew,
-        more=(write_units, write_compose),
+        more=(write_component,) if placed.kubernetes else (write_units, write_compose),
     )
 
     def show() -> None:

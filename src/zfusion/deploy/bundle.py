@@ -32,6 +32,7 @@ class Bundle:
         directory = scenario.absolute(".")
         self._original = Scenario.model_validate(document).with_paths(lambda path: str(directory / path))
         self._places: dict[str, str] = {}
+        self._taken: set[str] = set()
         self.scenario = self._original.with_paths(self._place)
 
     def _place(self, path: str) -> str:
@@ -39,13 +40,18 @@ class Bundle:
         if path not in self._places:
             given = PurePosixPath(path)
             several = (EACH,) if EACH in str(given.parent) else ()
-            target = PurePosixPath(DATA, *several, given.name)
+            target = str(PurePosixPath(DATA, *several, given.name))
             number = 2
-            while str(target) in self._places.values():
-                target = PurePosixPath(DATA, str(number), *several, given.name)
+            while not self._taken.isdisjoint(self._of_each(target)):
+                target = str(PurePosixPath(DATA, str(number), *several, given.name))
                 number += 1
-            self._places[path] = str(target)
+            self._places[path] = target
+            self._taken |= self._of_each(target)
         return self._places[path]
+
+    def _of_each(self, place: str) -> set[str]:
+        """The files that a place stands for."""
+        return {place.replace(EACH, str(i)) for i in self._original.ids}
 
     def write(self, directory: Path, nodes: Collection[NodeId]) -> list[str]:
         """Write the scenario and copy what these nodes need; the names of the files, relative to `directory`.

@@ -15,8 +15,8 @@ from typing import Any
 from zfusion.deploy.bundle import DATA
 from zfusion.deploy.plan import RECORDINGS, SCENARIO, Plan, Process
 from zfusion.deploy.systemd import MEMORY, SERVED
+from zfusion.deploy.yaml_file import write_yaml
 from zfusion.deploy.zenoh_file import AUTHORITY
-from zfusion.errors import InputError
 
 FILE = "compose.yaml"
 """In a host's folder."""
@@ -60,17 +60,11 @@ def compose(plan: Plan, host: str, *, data: bool = False) -> dict[str, Any]:
 
 def write_compose(plan: Plan, directory: Path) -> Iterator[Path]:
     """Write the compose files of all hosts into their folders; the files. InputError where the extra is missing."""
-    try:
-        import yaml  # noqa: PLC0415 - of an extra
-    except ImportError:
-        raise InputError("compose files need PyYAML: pip install 'zfusion[deploy]'") from None
     for host in plan.hosts.hosts:
         document = compose(plan, host, data=(directory / host / DATA).is_dir())
         if document["services"]:
             header = HEADER.format(host=host, run=plan.run, version=version("zfusion"))
-            text = yaml.safe_dump(document, sort_keys=False, width=120)
-            (directory / host / FILE).write_text(f"{header}\n{text}")
-            yield directory / host / FILE
+            yield write_yaml(directory / host / FILE, header, document)
 
 
 def _service(plan: Plan, process: Process, data: bool) -> dict[str, Any]:

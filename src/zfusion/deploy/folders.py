@@ -144,8 +144,9 @@ def _write_folders(plan: Plan, directory: Path, identities: Identities | None) -
             yield folder / process.zenoh_file
             if identities is not None:
                 yield from identities.write(process)
-        (folder / "README").write_text(_readme(plan, name))
-        yield folder / "README"
+        if not plan.hosts.kubernetes:
+            (folder / "README").write_text(_readme(plan, name))
+            yield folder / "README"
 
 
 def _remove(directory: Path, file: str) -> bool:

@@ -44,6 +44,14 @@ DEFAULT_PORT = 7450
 A_LIFE = 36_500
 """Days: a hundred years."""
 
+POD = "zfusion-node"
+"""The StatefulSet of the nodes; a pod's name ends with its number."""
+
+RECORDER_POD = "zfusion-recorder"
+
+SERVICE = "zfusion-nodes"
+"""By which pods have names: ``POD-NUMBER.SERVICE``."""
+
 
 def _bind(value: str) -> str:
     address = _as_ip(value)
@@ -135,7 +143,9 @@ class HostsFile(Spec):
     run: Annotated[str, Field(strict=True), AfterValidator(_run)] | None = None
     """The run's name; by default that of the scenario's file."""
     topology: Topology = "direct"
-    hosts: Annotated[dict[str, HostSpec], Field(min_length=1)]
+    hosts: Annotated[dict[str, HostSpec], Field(default_factory=dict)]
+    kubernetes: Flag = False
+    """Instead of hosts: a pod for every node, whose number is the node's id, and one for the recorder."""
     security: SecuritySpec = SecuritySpec()
 
     @classmethod
@@ -153,7 +163,10 @@ class HostsFile(Spec):
         except tomllib.TOMLDecodeError as error:
             raise ScenarioError(str(path), [Problem("file", str(path), f"expected valid TOML: {error}")]) from None
         hosts = cls._read(document, str(path))
-        problems = list(problems_of(hosts, scenario))
+        problems = list(_kind(hosts, scenario))
+        if not problems and hosts.kubernetes:
+            hosts = hosts.model_copy(update={"hosts": pods(scenario)})
+        problems = problems or list(problems_of(hosts, scenario))
         if problems:
             raise ScenarioError(str(path), problems)
         return hosts._anchored(path.parent.absolute())
@@ -169,6 +182,28 @@ class HostsFile(Spec):
     def host_of(self, node: NodeId) -> str:
         """The name of the host that runs a node."""
         return next(name for name, host in self.hosts.items() if node in host.nodes)
+
+
+def pods(scenario: Scenario) -> dict[str, HostSpec]:
+    """The pods of a scenario, as hosts."""
+    nodes = {f"{POD}-{i}": HostSpec(address=f"{POD}-{i}.{SERVICE}", bind="0.0.0.0", nodes=(i,)) for i in scenario.ids}
+    return {**nodes, RECORDER_POD: HostSpec(address=f"{RECORDER_POD}-0.{SERVICE}", recorder=True)}
+
+
+def _kind(hosts: HostsFile, scenario: Scenario) -> Iterator[Problem]:
+    """Either hosts or pods."""
+    if not hosts.kubernetes:
+        if not hosts.hosts:
+            yield Problem("hosts", {}, "expected a table [hosts.NAME] for each, or kubernetes = true")
+        return
+    if hosts.hosts:
+        yield Problem("hosts", sorted(hosts.hosts), "expected none where kubernetes = true")
+    if hosts.topology != "direct":
+        yield Problem("topology", hosts.topology, 'expected "direct" where kubernetes = true')
+    ids = scenario.ids
+    if isinstance(ids[0], str) or list(ids) != [ids[0] + n for n in range(len(ids))]:
+        expected = "expected a scenario whose ids are consecutive numbers: a pod's number is its node's id"
+        yield Problem("kubernetes", list(ids), expected)
 
 
 def problems_of(hosts: HostsFile, scenario: Scenario) -> Iterator[Problem]:
