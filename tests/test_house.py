@@ -40,7 +40,7 @@ ONLY = {
     "jinja2": ("report/page.py",),
     "pyarrow": ("report/results.py", "studies/experiment/table.py"),
     "typer": ("cli.py", "cli/"),
-    "yaml": ("deploy/compose.py",),
+    "yaml": ("deploy/yaml_file.py",),
     "prometheus_client": ("report/exporters.py",),
     "opentelemetry": ("report/exporters.py",),
     "psutil": ("swarm/watch.py",),

@@ -9,6 +9,7 @@
     folders    writes it all
     systemd    service units for it
     compose    a compose file for it
+    kubernetes where hosts are pods: what kustomize is told instead
 
 The folders, for ``zfusion deploy field.toml --hosts hosts.toml -o out``:
 
@@ -25,6 +26,8 @@ The folders, for ``zfusion deploy field.toml --hosts hosts.toml -o out``:
         systemd/                   its units, and how to install them
         compose.yaml               the same in containers
         recordings/                the recorder's, where there is one
+
+Where hosts are pods there are neither units nor compose files, but ``out/kustomization.yaml`` and two patches.
 
 Directories that hold keys have mode 0700, keys 0600. All paths in the files are relative to ``out/HOST``.
 """
