@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,8 @@ def swarm(directory: Path, *words: object, **tables: Any) -> Iterator[Swarm]:
 
 PACED = {"timing": {"rate_hz": 50.0}}
 ENDLESS = 1_000_000
+ALONE = {"matrix": [[int(i == j) for j in range(4)] for i in range(4)]}
+PAIRS = {"matrix": [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]}
 
 
 def intermediates(messages: list[Recorded], node: int) -> dict[int, list[int]]:
@@ -237,8 +239,7 @@ def test_nodes_that_all_die_at_once_go_on_together(tmp_path: Path) -> None:
 
 
 def test_a_node_that_is_alone_goes_on_with_the_step_that_is_due(tmp_path: Path) -> None:
-    network = {"matrix": [[int(i == j) for j in range(4)] for i in range(4)]}
-    with swarm(tmp_path, "--steps", ENDLESS, "--restart", network=network, **PACED) as running:
+    with swarm(tmp_path, "--steps", ENDLESS, "--restart", network=ALONE, **PACED) as running:
         running.wait_for(2, 20)
         os.kill(process_of(running.run, "--id", "2"), signal.SIGKILL)
         wait_until(lambda: running.last(2)["born"] > 20, f"node 2 has gone on\n{running.command.said()}")
@@ -250,18 +251,67 @@ def test_a_node_that_is_alone_goes_on_with_the_step_that_is_due(tmp_path: Path) 
     assert len({m["born"] for m in messages}) == 2
 
 
-def test_nodes_that_are_all_killed_by_plan_come_back_together(tmp_path: Path) -> None:
-    faults = [{"kind": "kill", "node": int(node), "step": 30, "restart_after": 60} for node in NODES]
-    scenario = variant(tmp_path, faults=faults, **PACED)
-    result = launch(tmp_path, scenario, "--steps", 600, "--record", "r.mcap")
+def lives(path: Path) -> dict[int, dict[int, list[int]]]:
+    """Node -> the first step of each life -> the steps of its estimates."""
+    found: dict[int, dict[int, list[int]]] = {}
+    for m in recorded(path):
+        if m.topic.endswith("/estimate"):
+            found.setdefault(m.payload["node"], {}).setdefault(m.payload["born"], []).append(m.payload["step"])
+    return found
+
+
+def killed_by_plan(
+    directory: Path, nodes: Iterable[int], *words: object, **tables: Any
+) -> dict[int, dict[int, list[int]]]:
+    """The lives of a run in which these nodes die at step 30, to begin again at step 90; nobody is lost by that."""
+    faults = [{"kind": "kill", "node": node, "step": 30, "restart_after": 60} for node in nodes]
+    result = launch(directory, variant(directory, faults=faults, **tables), *words, "--record", "r.mcap")
     assert result.code == 0, result.err
     summary = result.summary
-    assert (summary["failures"], summary["restarts"], summary["unreported_lives"]) == ([], 4, 0)
-    born = {
-        m.payload["node"]: m.payload["born"] for m in recorded(tmp_path / "r.mcap") if m.topic.endswith("/estimate")
-    }
-    assert all(step > 90 for step in born.values())
-    assert zfusion(tmp_path, "replay", "r.mcap", "--verify", "--json").code == 0
+    assert (summary["failures"], summary["restarts"], summary["unreported_lives"]) == ([], len(faults), 0)
+    verdict = zfusion(directory, "replay", "r.mcap", "--verify", "--json")
+    assert verdict.code == 0, verdict.out + verdict.err
+    found = lives(directory / "r.mcap")
+    for born in found.values():
+        for first, taken in born.items():
+            assert taken[0] >= first
+            assert taken == sorted(set(taken))
+    return found
+
+
+def test_nodes_that_are_all_killed_by_plan_come_back_together(tmp_path: Path) -> None:
+    for born in killed_by_plan(tmp_path, (1, 2, 3, 4), "--steps", 200, **PACED).values():
+        first, second = born
+        assert first == 1
+        assert second >= 90
+
+
+@pytest.mark.parametrize(
+    ("network", "nodes"),
+    [({}, (1, 2, 3, 4)), ({"network": ALONE}, (2,)), ({"network": ALONE}, (1, 2, 3, 4)), ({"network": PAIRS}, (1, 2))],
+    ids=["all", "one alone", "all alone", "a pair"],
+)
+def test_without_times_they_are_told_with_which_step(
+    tmp_path: Path, network: dict[str, Any], nodes: tuple[int, ...]
+) -> None:
+    found = killed_by_plan(tmp_path, nodes, "--free-run", "--steps", 300, **network)
+    whole, before, after = list(range(1, 301)), list(range(1, 30)), list(range(90, 301))
+    for node, born in found.items():
+        assert born == ({1: before, 90: after} if node in nodes else {1: whole})
+
+
+def test_without_times_a_node_that_is_alone_is_not_started_again(tmp_path: Path) -> None:
+    with swarm(tmp_path, "--steps", ENDLESS, "--restart", "--free-run", network=ALONE) as running:
+        running.wait_for(2, 20)
+        os.kill(process_of(running.run, "--id", "2"), signal.SIGKILL)
+        wait_until(lambda: "node 2 died" in running.command.said(), "the death is told")
+        running.command.interrupt()
+        result = running.command.wait()
+    assert result.code == 1
+    [failure] = result.summary["failures"]
+    assert failure.startswith("node 2 died")
+    assert result.summary["restarts"] == 0
+    assert all(list(born) == [1] for born in lives(running.recording).values())
 
 
 def test_a_run_without_times_has_failed_when_all_its_nodes_die_at_once(tmp_path: Path) -> None:

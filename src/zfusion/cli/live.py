@@ -194,6 +194,7 @@ def node(
     emulation: Annotated[
         bool, typer.Option("--emulation/--no-emulation", help="Do to messages what the scenario's links say.")
     ] = True,
+    first_step: Annotated[int, typer.Option(hidden=True)] = 1,
     health: Annotated[float, typer.Option(hidden=True)] = 0.0,
     as_json: Json = False,
     control_fd: ControlFd = None,
@@ -212,6 +213,7 @@ def node(
             endpoints=endpoints_of(loaded, own, listen, connect),
             recorder=await_recorder,
             epoch_ns=None if epoch is None else epoch_ns(epoch),
+            first_step=first_step,
             steps=None if forever else loaded.steps,
             emulate=emulation,
             health_s=0.0 if control is None else health,

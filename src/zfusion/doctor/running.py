@@ -112,9 +112,15 @@ def _clock(answer: Answer, clock: Clock, limit_ns: int | None) -> Iterator[Findi
         )
         return
     ahead, uncertainty = offset.found
-    said = f"{said}; its clock is {ahead / 1e6:+.3g} ms ahead, to within {uncertainty / 1e6:.2g} ms"
+    where = "behind" if ahead < 0 else "ahead"
+    said = f"{said}; its clock is {_in_words(abs(ahead))} {where}, to within {_in_words(uncertainty)}"
     if limit_ns is not None and abs(ahead) - uncertainty > limit_ns:
         why = f"{limit_ns / 1e6:g} ms are allowed: nodes refuse to start, or messages are late"
         yield TOPIC.error(said, why, REMEDY.removeprefix(": "))
     else:
         yield TOPIC.ok(said)
+
+
+def _in_words(duration_ns: float) -> str:
+    """In milliseconds, or in seconds to the millisecond."""
+    return f"{duration_ns / 1e6:.3g} ms" if duration_ns < 1e9 else f"{duration_ns / 1e9:.3f} s"

@@ -79,6 +79,8 @@ class LiveOptions:
     """Wait for a recorder before beginning."""
     epoch_ns: int | None = None
     """When step 0 is; by default what the scenario says, or what the swarm agrees on."""
+    first_step: int = 1
+    """With which to begin, unless it is with the others'."""
     steps: int | None = None
     """Last step; None: until told to stop."""
     emulate: bool = True
@@ -147,7 +149,14 @@ class LiveNode:
         self._links = link if isinstance(link, LinkNetwork) else None
         self._hearing = self._hears()
         epoch_ns = options.epoch_ns if options.epoch_ns is not None else scenario.timing.epoch_ns
-        self._meeting = make_meeting(scenario, self._graph, node, needs_recorder=options.recorder, epoch_ns=epoch_ns)
+        self._meeting = make_meeting(
+            scenario,
+            self._graph,
+            node,
+            needs_recorder=options.recorder,
+            epoch_ns=epoch_ns,
+            first_step=options.first_step,
+        )
         why = prober(options.endpoints, scenario.zenoh_config)
         self._presence = Presence(
             self, self._meeting, scenario, self._graph, options.run, self._session, self._inbox, self._clock, why

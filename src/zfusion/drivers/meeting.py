@@ -60,6 +60,8 @@ class Meeting:
     epoch_ns: int | None = None
     fixed_epoch: bool = False
     """The epoch was given: it is kept to, whoever is there by then."""
+    first_step: int = 1
+    """With which step to begin where nobody is running: a later one where the run had come so far before all died."""
     moved_ns: int = 0
     """How far the node's clock was set forward since it was started."""
     present: set[NodeId] = field(default_factory=set)
@@ -122,7 +124,7 @@ class Meeting:
                 lead = 0 if self.period_ns is None else LEAD_NS + 2 * self.hops * POLL_NS - self.period_ns
                 self.epoch_ns = now + lead
             if self.epoch_ns is not None:
-                return Start(1, self.epoch_ns, self.hears)
+                return Start(self.first_step, self.epoch_ns, self.hears)
         return None
 
     def _join_running(self, now: int) -> Start | None:
@@ -143,7 +145,12 @@ class Meeting:
         return self.linked if now < self.started_ns + self.moved_ns + JOIN_NS else frozenset(self.present)
 
     def _begin_without_the_rest(self, now: int) -> Start | None:
-        """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there."""
+        """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there.
+
+        Where steps have no times, begin with a given step, if the others have not come within the time for joining.
+        """
+        if self.period_ns is None and self.first_step > 1 and self._awaited(now) != self.linked:
+            return Start(self.first_step, now, self.hears & self.heard.keys())
         if not self.fixed_epoch or self.epoch_ns is None or self.period_ns is None:
             return None
         if now < self.epoch_ns + self.period_ns:

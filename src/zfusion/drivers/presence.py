@@ -375,7 +375,13 @@ class Presence:
 
 
 def make_meeting(
-    scenario: Scenario, graph: Network, own: NodeId, *, needs_recorder: bool, epoch_ns: int | None
+    scenario: Scenario,
+    graph: Network,
+    own: NodeId,
+    *,
+    needs_recorder: bool,
+    epoch_ns: int | None,
+    first_step: int,
 ) -> Meeting:
     """The meeting of a node whose process begins now; `graph` is the method's, `epoch_ns` is given or agreed on."""
     links = links_of(scenario)
@@ -392,4 +398,5 @@ def make_meeting(
         period_ns=scenario.timing.period_ns,
         epoch_ns=epoch_ns,
         fixed_epoch=epoch_ns is not None,
+        first_step=first_step,
     )

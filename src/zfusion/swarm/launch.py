@@ -8,9 +8,10 @@ from __future__ import annotations
 import selectors
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -170,20 +171,25 @@ class Launcher:
                 self._recorder.command += ["--network", kind]
         return network.running and not self._interrupts
 
-    def _start(self, child: Child) -> None:
+    def _start(self, child: Child, first_step: int | None = None) -> None:
         entrance: Sequence[str] = ()
         if self._network is not None and child is not self._network:
             entrance = self._network.status["enter"][child.place]
-        line = child.start(entrance, self._where_it_was(child))
+        where = self._where_it_was(child) if first_step is None else ("--first-step", str(first_step))
+        line = child.start(entrance, where)
+        child.resumes = first_step is not None
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _where_it_was(self, child: Child) -> Sequence[str]:
         """What has a node of paced steps, started again, go on with the one that is due where no other can tell it."""
-        alone = child.node is not None and frozenset({child.node}) in self._parts
-        if not alone or child.epoch_ns is None or self._scenario.timing.period_ns is None:
+        if len(self._part_of(child)) != 1 or child.epoch_ns is None or self._scenario.timing.period_ns is None:
             return ()
         epoch_s = self._clock.on_machine(child.epoch_ns) / 1e9
         return "--epoch", datetime.fromtimestamp(epoch_s, UTC).isoformat()
+
+    def _part_of(self, child: Child) -> frozenset[NodeId]:
+        """The nodes that a node is connected with, itself included; none for who is no node."""
+        return next((part for part in self._parts if child.node in part), frozenset())
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
@@ -203,14 +209,17 @@ class Launcher:
                 return
 
     def _goes_on(self) -> bool:
-        """Whether a node's process runs; or all were felled by plan, and some return at a time before the last step."""
-        nodes = self._nodes.values()
-        if any(child.running for child in nodes):
+        """Whether a node's process runs; or all that are connected were felled by plan, and return before the end."""
+        if any(child.running for child in self._nodes.values()):
             return True
-        if self._stop_by is not None or any(child.exit_code == 0 for child in nodes):
+        if self._stop_by is not None:
             return False
-        blows = [child.blow for child in nodes if child.blow is not None and child.blow["until_ns"] is not None]
-        return any(blow["until_step"] <= self._scenario.steps for blow in blows)
+        for part in self._parts:
+            nodes = [self._nodes[i] for i in part]
+            ended = any(child.exit_code == 0 for child in nodes)
+            if not ended and _first_return(nodes) <= self._scenario.steps:
+                return True
+        return False
 
     def _help_who_finds_nobody(self) -> None:
         """Have nodes end, or begin together, that would wait for ever for those that they are to join."""
@@ -229,7 +238,8 @@ class Launcher:
         """Have nodes go on together that all died at about the same time, where steps have times: else all is lost."""
         if self._scenario.timing.period_ns is None:
             for child in left:
-                self._dismiss(child, f"{child.name} found nobody to join: all had died at about the same time")
+                if not child.resumes:
+                    self._dismiss(child, f"{child.name} found nobody to join: all had died at about the same time")
             return
         for child in left:
             if not child.resumes and child.line is not None:
@@ -329,16 +339,21 @@ class Launcher:
         Seconds until the next one's may come.
         """
         wait = TICK_S
-        for child in self._nodes.values():
-            if child.blow is None or child.blow["until_step"] is None or self._stop_by is not None:
-                continue
-            left = self._left(child, child.blow)
+        standing = {child.node for child in self._nodes.values() if child.running}
+        fallen = [
+            (child, child.blow, self._left(child, child.blow))
+            for child in self._nodes.values()
+            if child.blow is not None and child.blow["until_step"] is not None and self._stop_by is None
+        ]
+        for child, blow, left in fallen:
             if left > 0:
                 wait = min(wait, left)
-            elif child.blow["kind"] == "kill" and not child.running:
+            elif blow["kind"] == "kill" and not child.running:
                 child.blow = None
                 child.restarts += 1
-                self._start(child)
+                # Where steps have no times, and nobody is left who could tell it how far they are, it is told here.
+                untold = self._scenario.timing.period_ns is None and standing.isdisjoint(self._part_of(child))
+                self._start(child, blow["until_step"] if untold else None)
             elif child.process is not None and is_stopped(child.process.pid) is not False:
                 child.blow = None
                 child.process.send_signal(signal.SIGCONT)
@@ -352,13 +367,16 @@ class Launcher:
             left: float = (blow["until_ns"] - self._clock.now()) / 1e9
             return left
         others = [other for other in self._nodes.values() if other is not child and other.running]
-        reached = any(other.status.get("step", 0) >= blow["until_step"] for other in others)
-        return 0 if reached or (not others and blow["kind"] == "stop") else TICK_S
+        if not others:  # nobody takes the steps that it would be away for
+            return 0 if blow["kind"] == "stop" or blow["until_step"] == _first_return(self._nodes.values()) else TICK_S
+        return 0 if any(other.status.get("step", 0) >= blow["until_step"] for other in others) else TICK_S
 
     def _may_restart(self, child: Child) -> bool:
+        """Whether a node that died is to be started again; where it was, its neighbours tell it, or the time."""
         return (
             self._options.restart
             and child.node is not None
+            and (self._scenario.timing.period_ns is not None or len(self._part_of(child)) > 1)
             and self._begun
             and self._stop_by is None
             and child.restarts < MAX_RESTARTS
@@ -413,3 +431,9 @@ class Launcher:
                 child.note_cut_short()
                 self._selector.unregister(child.line.socket)
                 child.line.close()
+
+
+def _first_return(nodes: Iterable[Child]) -> float:
+    """The first step at which one that was felled by plan is to return; infinite where none is."""
+    steps = [child.blow["until_step"] for child in nodes if child.blow is not None]
+    return min((step for step in steps if step is not None), default=inf)
