@@ -58,7 +58,7 @@ class Town:
     peers: dict[int, Peer] = field(default_factory=dict)
     lives: int = 0
 
-    def add(self, node: int, *, fingerprint: str | None = None, version: str = "1.0") -> Peer:
+    def add(self, node: int, *, fingerprint: str | None = None, version: str = "1.0", first_step: int = 1) -> Peer:
         """A node's process starts, and is linked with those that are there."""
         self.lives += 1
         swarm = connected(node, self.links)
@@ -76,6 +76,7 @@ class Town:
                 period_ns=self.period,
                 epoch_ns=self.epoch,
                 fixed_epoch=self.epoch is not None,
+                first_step=first_step,
             )
         )
         for other in linked & self.peers.keys():
@@ -220,6 +221,27 @@ def test_nobody_begins_without_the_recorder() -> None:
     town.peers[2].meeting.recorder = True
     town.poll_all(5)
     assert all(peer.start for peer in town.peers.values())
+
+
+def test_those_that_were_told_with_which_step_begin_together() -> None:
+    town = Town(line(1, 2), (1, 2))
+    for node in (1, 2):
+        town.add(node, first_step=90)
+    town.poll_all(2)
+    assert {peer.start.born for peer in town.peers.values() if peer.start} == {90}
+    assert {peer.start.expected for peer in town.peers.values() if peer.start} == {frozenset({1}), frozenset({2})}
+
+
+def test_those_that_were_told_with_which_step_do_not_wait_for_who_does_not_come() -> None:
+    town = Town(line(1, 2, 3), (1, 2, 3))
+    for node in (1, 2):
+        town.add(node, first_step=90)
+    town.poll_all(4)
+    assert not any(peer.start for peer in town.peers.values())
+    town.now += JOIN_NS
+    assert town.poll(1) == Start(90, town.now, frozenset({2}))
+    town.peers[1].step = 95
+    assert town.poll(2) == Start(96, town.now, frozenset({1}))
 
 
 def test_parts_that_are_not_connected_begin_by_themselves() -> None:

@@ -142,14 +142,18 @@ class Meeting:
 
     def _awaited(self, now: int) -> frozenset[NodeId]:
         """Whose answers a node that finds others running waits for."""
-        return self.linked if now < self.started_ns + self.moved_ns + JOIN_NS else frozenset(self.present)
+        return frozenset(self.present) if self._has_waited(now) else self.linked
+
+    def _has_waited(self, now: int) -> bool:
+        """Whether the time is over for those that it does not see to come."""
+        return now >= self.started_ns + self.moved_ns + JOIN_NS
 
     def _begin_without_the_rest(self, now: int) -> Start | None:
         """Keep to a given epoch: once step 1 has begun, begin with the next, and with those who are there.
 
         Where steps have no times, begin with a given step, if the others have not come within the time for joining.
         """
-        if self.period_ns is None and self.first_step > 1 and self._awaited(now) != self.linked:
+        if self.period_ns is None and self.first_step > 1 and self._has_waited(now):
             return Start(self.first_step, now, self.hears & self.heard.keys())
         if not self.fixed_epoch or self.epoch_ns is None or self.period_ns is None:
             return None
