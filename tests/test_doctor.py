@@ -488,6 +488,16 @@ def test_the_command_ends_with_one_where_there_is_an_error_and_fits_on_a_screen(
     assert any("none.toml" in f.what for f in hosts if f.severity is Severity.ERROR)
 
 
+def test_pods_are_not_looked_for_outside_of_their_cluster() -> None:
+    hosts = EXAMPLE.parents[1] / "deploy" / "kubernetes" / "hosts.toml"
+    findings = [f for f in examine(Asked(EXAMPLE, hosts=hosts)) if f.topic in {"hosts", "names", "ports", "running"}]
+    none, *_ = findings
+    assert [f.severity for f in findings] == [Severity.WARNING]
+    assert "none of the pods" in none.what
+    inside = list(examine(Asked(EXAMPLE, hosts=hosts, host="zfusion-node-4")))
+    assert any("zfusion-nodes" in f.what for f in inside if f.topic == "names")
+
+
 def test_a_deployed_host_is_recognised_by_its_address(deployed: tuple[Plan, Path]) -> None:
     _, out = deployed
     result = zfusion(out.parent, "doctor", EXAMPLE, "--hosts", out.parent / "hosts.toml", "--folder", out, "--json")

@@ -88,6 +88,9 @@ def _told(ground: Ground) -> Finding:
     if ground.host is not None:
         said = ", ".join(process.name for process in ground.processes) or "nothing"
         return HOSTS.ok(f"this machine is {ground.host}, and runs {said}")
+    if ground.in_cluster:
+        why = "their names are known in the cluster only: neither these nor what runs there were looked at"
+        return HOSTS.warning("this machine is none of the pods", why, "look at them with kubectl, or run it in one")
     why = "what a host listens at, its certificates and limits were not looked at"
     return HOSTS.warning("this machine is not one, and only one, of the hosts", why, "--host NAME, or run it there")
 

@@ -93,6 +93,11 @@ class Ground:
             return len(self.plan.hosts.hosts) > 1 or self.host is None
         return len(self.nodes) < len(self.scenario.ids)
 
+    @property
+    def in_cluster(self) -> bool:
+        """Whether the swarm is where this machine is not: in a cluster of Kubernetes."""
+        return self.plan is not None and self.plan.hosts.kubernetes and self.host is None
+
     @cached_property
     def listens(self) -> dict[str, str]:
         """Endpoints that processes here listen at, and whose they are, in words."""
@@ -103,7 +108,12 @@ class Ground:
 
     @cached_property
     def dials(self) -> tuple[str, ...]:
-        """Endpoints elsewhere that processes here dial; where this machine is none of the hosts, all of them."""
+        """Endpoints elsewhere that processes here dial; where this machine is none of the hosts, all of them.
+
+        None where that is because they are pods: who is not in the cluster does not know their names.
+        """
+        if self.in_cluster:
+            return ()
         if self.plan is not None:
             processes = self.processes or self.plan.processes
             dials = [endpoint for process in processes for endpoint in process.connect]

@@ -338,28 +338,36 @@ class Launcher:
 
         Seconds until the next one's may come.
         """
-        wait = TICK_S
-        standing = {child.node for child in self._nodes.values() if child.running}
-        fallen = [
-            (child, child.blow, self._left(child, child.blow))
-            for child in self._nodes.values()
-            if child.blow is not None and child.blow["until_step"] is not None and self._stop_by is None
-        ]
-        for child, blow, left in fallen:
+        wait, again = TICK_S, []
+        for child in self._nodes.values():
+            if child.blow is None or child.blow["until_step"] is None or self._stop_by is not None:
+                continue
+            left = self._left(child, child.blow)
             if left > 0:
                 wait = min(wait, left)
-            elif blow["kind"] == "kill" and not child.running:
-                child.blow = None
-                child.restarts += 1
-                # Where steps have no times, and nobody is left who could tell it how far they are, it is told here.
-                untold = self._scenario.timing.period_ns is None and standing.isdisjoint(self._part_of(child))
-                self._start(child, blow["until_step"] if untold else None)
-            elif child.process is not None and is_stopped(child.process.pid) is not False:
+            elif not _has_fallen(child):
+                wait = min(wait, BLINK_S)
+            elif child.blow["kind"] == "kill":
+                again.append(child)
+            elif child.process is not None:
                 child.blow = None
                 child.process.send_signal(signal.SIGCONT)
-            else:
-                wait = min(wait, BLINK_S)
+        self._start_again(again)
         return wait
+
+    def _start_again(self, fallen: Sequence[Child]) -> None:
+        """Start nodes that were killed by plan.
+
+        Where steps have no times, and nobody is left who could tell them how far the others are, they are told here.
+        """
+        standing = {child.node for child in self._nodes.values() if child.running}
+        steps = {child.node: child.blow["until_step"] for child in fallen if child.blow is not None}
+        for child in fallen:
+            part = self._part_of(child)
+            untold = self._scenario.timing.period_ns is None and standing.isdisjoint(part)
+            child.blow = None
+            child.restarts += 1
+            self._start(child, max(steps[node] for node in part & steps.keys()) if untold else None)
 
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
@@ -437,3 +445,10 @@ def _first_return(nodes: Iterable[Child]) -> float:
     """The first step at which one that was felled by plan is to return; infinite where none is."""
     steps = [child.blow["until_step"] for child in nodes if child.blow is not None]
     return min((step for step in steps if step is not None), default=inf)
+
+
+def _has_fallen(child: Child) -> bool:
+    """Whether what it has announced has happened: it is dead; or it stands still, as far as that can be seen."""
+    if child.blow is None or child.process is None or child.blow["kind"] == "kill":
+        return not child.running
+    return is_stopped(child.process.pid) is not False
