@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -264,7 +264,14 @@ def killed_by_plan(
     directory: Path, nodes: Iterable[int], *words: object, **tables: Any
 ) -> dict[int, dict[int, list[int]]]:
     """The lives of a run in which these nodes die at step 30, to begin again at step 90; nobody is lost by that."""
-    faults = [{"kind": "kill", "node": node, "step": 30, "restart_after": 60} for node in nodes]
+    return killed_for(dict.fromkeys(nodes, 60), directory, *words, **tables)
+
+
+def killed_for(
+    away: Mapping[int, int], directory: Path, *words: object, **tables: Any
+) -> dict[int, dict[int, list[int]]]:
+    """Likewise; nodes are away for so many steps each."""
+    faults = [{"kind": "kill", "node": node, "step": 30, "restart_after": steps} for node, steps in away.items()]
     result = launch(directory, variant(directory, faults=faults, **tables), *words, "--record", "r.mcap")
     assert result.code == 0, result.err
     summary = result.summary
@@ -298,6 +305,16 @@ def test_without_times_they_are_told_with_which_step(
     whole, before, after = list(range(1, 301)), list(range(1, 30)), list(range(90, 301))
     for node, born in found.items():
         assert born == ({1: before, 90: after} if node in nodes else {1: whole})
+
+
+def test_without_times_those_of_a_part_that_fell_together_begin_together(tmp_path: Path) -> None:
+    """The others run far ahead; whether both are raised at once or one after the other, they begin with one step."""
+    found = killed_for({1: 60, 2: 70}, tmp_path, "--free-run", "--steps", 300, network=PAIRS)
+    [first] = {max(found[node]) for node in (1, 2)}
+    assert first in {90, 100}
+    assert all(found[node][first] == list(range(first, 301)) for node in (1, 2))
+    used = intermediates(recorded(tmp_path / "r.mcap"), 1)
+    assert [1, 2] in [used[step] for step in range(first, 301)]
 
 
 def test_without_times_a_node_that_is_alone_is_not_started_again(tmp_path: Path) -> None:

@@ -50,6 +50,8 @@ class Child:
     restarts: int = 0
     resumes: bool = False
     """Whether it was told to begin in the midst of the run."""
+    first_step: int | None = None
+    """With which step, where steps have no times."""
     blow: Mapping[str, Any] | None = None
     """What has felled it by plan, as `misfortune.Blow`, until it is raised again."""
 

@@ -177,7 +177,7 @@ class Launcher:
             entrance = self._network.status["enter"][child.place]
         where = self._where_it_was(child) if first_step is None else ("--first-step", str(first_step))
         line = child.start(entrance, where)
-        child.resumes = first_step is not None
+        child.first_step, child.resumes = first_step, first_step is not None
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _where_it_was(self, child: Child) -> Sequence[str]:
@@ -358,16 +358,24 @@ class Launcher:
     def _start_again(self, fallen: Sequence[Child]) -> None:
         """Start nodes that were killed by plan.
 
-        Where steps have no times, and nobody is left who could tell them how far the others are, they are told here.
+        Where steps have no times, and none of those that they are connected with takes steps, all begin with one step.
         """
-        standing = {child.node for child in self._nodes.values() if child.running}
-        steps = {child.node: child.blow["until_step"] for child in fallen if child.blow is not None}
-        for child in fallen:
-            part = self._part_of(child)
-            untold = self._scenario.timing.period_ns is None and standing.isdisjoint(part)
+        first_steps = [self._common_step(child, fallen) for child in fallen]
+        for child, first_step in zip(fallen, first_steps, strict=True):
             child.blow = None
             child.restarts += 1
-            self._start(child, max(steps[node] for node in part & steps.keys()) if untold else None)
+            self._start(child, first_step)
+
+    def _common_step(self, child: Child, fallen: Sequence[Child]) -> int | None:
+        """With which step a node and those that fell with it are to begin; None where others or the time tell them."""
+        part = self._part_of(child)
+        standing = [self._nodes[i] for i in part if self._nodes[i].running]
+        paced = self._scenario.timing.period_ns is not None
+        if paced or any(other.status.get("phase") == "running" for other in standing):
+            return None
+        told = [other.first_step for other in standing if other.first_step is not None]
+        steps = [other.blow["until_step"] for other in fallen if other.node in part and other.blow is not None]
+        return max(told or steps)
 
     def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
         """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
