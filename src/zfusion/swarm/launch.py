@@ -8,10 +8,9 @@ from __future__ import annotations
 import selectors
 import signal
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +24,12 @@ from zfusion.errors import InputError
 from zfusion.model.scenario import Scenario
 from zfusion.model.types import NodeId
 from zfusion.swarm.child import Child, bereft, latecomers
+from zfusion.swarm.fallen import TICK_S, Fallen
 from zfusion.swarm.processes import processes
-from zfusion.swarm.standstill import STANDSTILL_S, Standstill, is_stopped
+from zfusion.swarm.standstill import STANDSTILL_S, Standstill
 
 STOP_S = 15.0
 """How long a process that was told to stop may take: a node waits some seconds for its neighbours to hear it out."""
-
-TICK_S = 0.1
-"""How often processes are looked after when nothing is heard of them."""
-
-BLINK_S = 0.002
-"""How soon it is looked again whether a process that has said that it stops, or dies, has done so."""
 
 MAX_RESTARTS = 10
 """Lives that `restart` gives a node beyond the first; one that keeps dying has a cause that more lives do not mend."""
@@ -119,6 +113,7 @@ class Launcher:
         )
         self._network, self._recorder = self._processes.network, self._processes.recorder
         self._nodes = self._processes.nodes
+        self._fallen = Fallen(self._nodes, self._parts, scenario.timing.period_ns is not None)
 
     def run(self) -> RunResult:
         """Start all, watch until all nodes have ended, finish the recording.
@@ -212,14 +207,7 @@ class Launcher:
         """Whether a node's process runs; or all that are connected were felled by plan, and return before the end."""
         if any(child.running for child in self._nodes.values()):
             return True
-        if self._stop_by is not None:
-            return False
-        for part in self._parts:
-            nodes = [self._nodes[i] for i in part]
-            ended = any(child.exit_code == 0 for child in nodes)
-            if not ended and _first_return(nodes) <= self._scenario.steps:
-                return True
-        return False
+        return self._stop_by is None and self._fallen.returns(self._scenario.steps)
 
     def _help_who_finds_nobody(self) -> None:
         """Have nodes end, or begin together, that would wait for ever for those that they are to join."""
@@ -338,54 +326,18 @@ class Launcher:
 
         Seconds until the next one's may come.
         """
-        wait, again = TICK_S, []
-        for child in self._nodes.values():
-            if child.blow is None or child.blow["until_step"] is None or self._stop_by is not None:
-                continue
-            left = self._left(child, child.blow)
-            if left > 0:
-                wait = min(wait, left)
-            elif not _has_fallen(child):
-                wait = min(wait, BLINK_S)
-            elif child.blow["kind"] == "kill":
-                again.append(child)
+        if self._stop_by is not None:
+            return TICK_S
+        raised, wait = self._fallen.due(self._clock.now())
+        first_steps = [self._fallen.first_step(child, raised) for child in raised]
+        for child, first_step in zip(raised, first_steps, strict=True):
+            died, child.blow = not child.running, None
+            if died:
+                child.restarts += 1
+                self._start(child, first_step)
             elif child.process is not None:
-                child.blow = None
                 child.process.send_signal(signal.SIGCONT)
-        self._start_again(again)
         return wait
-
-    def _start_again(self, fallen: Sequence[Child]) -> None:
-        """Start nodes that were killed by plan.
-
-        Where steps have no times, and none of those that they are connected with takes steps, all begin with one step.
-        """
-        first_steps = [self._common_step(child, fallen) for child in fallen]
-        for child, first_step in zip(fallen, first_steps, strict=True):
-            child.blow = None
-            child.restarts += 1
-            self._start(child, first_step)
-
-    def _common_step(self, child: Child, fallen: Sequence[Child]) -> int | None:
-        """With which step a node and those that fell with it are to begin; None where others or the time tell them."""
-        part = self._part_of(child)
-        standing = [self._nodes[i] for i in part if self._nodes[i].running]
-        paced = self._scenario.timing.period_ns is not None
-        if paced or any(other.status.get("phase") == "running" for other in standing):
-            return None
-        told = [other.first_step for other in standing if other.first_step is not None]
-        steps = [other.blow["until_step"] for other in fallen if other.node in part and other.blow is not None]
-        return max(told or steps)
-
-    def _left(self, child: Child, blow: Mapping[str, Any]) -> float:
-        """Seconds until a felled node is to be raised; where steps have no times, at least until it is looked after."""
-        if blow["until_ns"] is not None:
-            left: float = (blow["until_ns"] - self._clock.now()) / 1e9
-            return left
-        others = [other for other in self._nodes.values() if other is not child and other.running]
-        if not others:  # nobody takes the steps that it would be away for
-            return 0 if blow["kind"] == "stop" or blow["until_step"] == _first_return(self._nodes.values()) else TICK_S
-        return 0 if any(other.status.get("step", 0) >= blow["until_step"] for other in others) else TICK_S
 
     def _may_restart(self, child: Child) -> bool:
         """Whether a node that died is to be started again; where it was, its neighbours tell it, or the time."""
@@ -447,16 +399,3 @@ class Launcher:
                 child.note_cut_short()
                 self._selector.unregister(child.line.socket)
                 child.line.close()
-
-
-def _first_return(nodes: Iterable[Child]) -> float:
-    """The first step at which one that was felled by plan is to return; infinite where none is."""
-    steps = [child.blow["until_step"] for child in nodes if child.blow is not None]
-    return min((step for step in steps if step is not None), default=inf)
-
-
-def _has_fallen(child: Child) -> bool:
-    """Whether what it has announced has happened: it is dead; or it stands still, as far as that can be seen."""
-    if child.blow is None or child.process is None or child.blow["kind"] == "kill":
-        return not child.running
-    return is_stopped(child.process.pid) is not False
