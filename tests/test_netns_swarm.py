@@ -329,7 +329,7 @@ def test_netem_is_refused_where_there_is_none(tmp_path: Path) -> None:
     assert "--netns-with tun" in result.error
 
 
-@pytest.mark.skipif(NO_NETEM is not None, reason=f"this kernel has no netem: {NO_NETEM}")
+@pytest.mark.skipif(NO_NETEM is not None, reason=f"no netem here: {NO_NETEM}")
 def test_a_delay_by_netem_is_measured(tmp_path: Path) -> None:
     delayed = scenario(tmp_path, "delayed", links={"delay": 0.01, "loss": 0.02}, timing={"rate_hz": 10.0})
     result = launch(tmp_path, delayed, "--netns-with", "netem", "--steps", 25, "--record", "x.mcap")
