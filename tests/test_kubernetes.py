@@ -90,7 +90,12 @@ def pods(manifests: list[Manifest]) -> dict[str, tuple[Manifest, Manifest]]:
 def contents_of(manifests: list[Manifest], volume: Manifest) -> dict[str, bytes]:
     """Path -> what is in a volume that a container reads."""
     if "projected" in volume:
-        sources = [("Secret", source["secret"]["name"], source["secret"]) for source in volume["projected"]["sources"]]
+        kinds = {"secret": "Secret", "configMap": "ConfigMap"}
+        sources = [
+            (kinds[kind], part["name"], part)
+            for source in volume["projected"]["sources"]
+            for kind, part in source.items()
+        ]
     elif "secret" in volume:
         sources = [("Secret", volume["secret"]["secretName"], volume["secret"])]
     else:
@@ -154,12 +159,12 @@ def test_each_pod_sees_the_files_of_its_folder(cluster: Cluster) -> None:
     plan, folders, manifests = cluster
     hosts = {p.host: ("zfusion-node" if p.kind == "node" else "zfusion-recorder", p.node) for p in plan.processes}
     own = {host: files_in(folders / host) for host in hosts}
-    everybodys = {path: data for files in own.values() for path, data in files.items() if not path.startswith("tls/")}
+    everybodys = {path: data for files in own.values() for path, data in files.items() if path.startswith("data/")}
     for host, (name, number) in hosts.items():
         seen = seen_by(manifests, name, number)
         assert own[host].items() <= seen.items()
         more = {path: data for path, data in seen.items() if path not in own[host]}
-        assert more.items() <= everybodys.items()  # and of the keys its own alone
+        assert more.items() <= everybodys.items()  # and of keys and configurations its own alone
 
 
 def files_in(folder: Path) -> dict[str, bytes]:

@@ -2,8 +2,8 @@
 
 How pods are kept, what they may do and who may reach them stands in ``deploy/kubernetes``, for every scenario alike.
 The component adds what depends on the scenario: how many nodes there are, the words that start them, and their
-configurations, data files and keys. All pods of a set have the same volumes; each container is given the directory with
-its own key.
+configurations, data files and keys. All pods of a set have the same volumes; of these each container is given the
+directory with what is its own.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def _component(plan: Plan, directory: Path, data: _Data) -> Document:
     served = [process for process in plan.processes if process.kind in {"node", "recorder"}]
     maps: dict[str, Files] = {
         "zfusion-scenario": {SCENARIO: f"{RECORDER_POD}/{SCENARIO}"},
-        "zfusion-zenoh": _by_name(served, lambda process: (process.zenoh_file,)),
+        **({"zfusion-data": data.files} if data.files else {}),
+        **{process.host: _by_name(process, _zenoh(process)) for process in served},
     }
-    maps |= {"zfusion-data": data.files} if data.files else {}
     for name, files in maps.items():
         size = sum((directory / file).stat().st_size for file in files.values())
         if size > MAX_MAP:
@@ -89,7 +89,7 @@ def _component(plan: Plan, directory: Path, data: _Data) -> Document:
                 f"{directory}: {name}: expected files of at most {MAX_MAP} bytes together, as a ConfigMap has "
                 f"(they have {size}): {', '.join(files.values())}"
             )
-    secrets = {process.host: _by_name([process], _tls) for process in served} if plan.secured else {}
+    secrets = {process.host: _by_name(process, _tls(process)) for process in served} if plan.secured else {}
     return {
         "apiVersion": "kustomize.config.k8s.io/v1alpha1",
         "kind": "Component",
@@ -99,12 +99,16 @@ def _component(plan: Plan, directory: Path, data: _Data) -> Document:
     }
 
 
-def _by_name(processes: Iterable[Process], files: Callable[[Process], Iterable[str]]) -> Files:
-    """The files of processes by their names."""
-    return {Path(file).name: f"{process.host}/{file}" for process in processes for file in files(process)}
+def _by_name(process: Process, files: Iterable[str]) -> Files:
+    """A process' files by their names."""
+    return {Path(file).name: f"{process.host}/{file}" for file in files}
 
 
-def _tls(process: Process) -> tuple[str, str, str]:
+def _zenoh(process: Process) -> tuple[str, ...]:
+    return (process.zenoh_file,)
+
+
+def _tls(process: Process) -> tuple[str, ...]:
     return AUTHORITY, process.certificate, process.key
 
 
@@ -113,38 +117,49 @@ def _generator(name: str, files: Files) -> Document:
 
 
 def _nodes(plan: Plan, data: _Data) -> Document:
-    """The nodes: as many as there are, each with its own key and configuration."""
+    """The nodes: as many as there are, each with its own configuration and key."""
     nodes = [process for process in plan.processes if process.kind == "node"]
-    sources = [
-        {"secret": {"name": process.host, "items": [_item(Path(file).name, process.node) for file in _tls(process)]}}
-        for process in nodes
-    ]
-    keys = {"name": "tls", "projected": {"defaultMode": READABLE, "sources": sources}}
+    volumes = [_of_each("zenoh", "configMap", _zenoh, nodes), *data.volume(process.host for process in nodes)]
+    if plan.secured:
+        volumes.append(_of_each("tls", "secret", _tls, nodes))
     words = (*plan.command(replace(nodes[0], node=NODE)), "--forever")
-    volumes = [*([keys] if plan.secured else []), *data.volume(process.host for process in nodes)]
-    document = _stateful_set(POD, "node", words, volumes, {"tls": {"subPathExpr": NODE}})
+    document = _stateful_set(POD, "node", words, volumes)
     document["spec"] |= {"replicas": len(nodes), "ordinals": {"start": nodes[0].node}}
     return document
 
 
-def _item(name: str, directory: object) -> Document:
-    return {"key": name, "path": f"{directory}/{name}"}
+def _of_each(name: str, kind: str, files: Callable[[Process], Iterable[str]], nodes: Iterable[Process]) -> Document:
+    """A volume that has for each node a directory, called as its pod's number, with what is its own."""
+    sources = [
+        {
+            kind: {
+                "name": node.host,
+                "items": [{"key": key, "path": f"{node.node}/{key}"} for key in _by_name(node, files(node))],
+            }
+        }
+        for node in nodes
+    ]
+    return {"name": name, "projected": {"defaultMode": READABLE, "sources": sources}}
 
 
 def _recorder(plan: Plan, data: _Data) -> Document:
     (recorder,) = (process for process in plan.processes if process.kind == "recorder")
-    keys = {"name": "tls", "secret": {"secretName": recorder.host, "defaultMode": READABLE}}
-    volumes = [*([keys] if plan.secured else []), *data.volume([recorder.host])]
-    return _stateful_set(RECORDER_POD, "recorder", plan.command(recorder), volumes, {})
+    volumes = [{"name": "zenoh", "configMap": {"name": recorder.host}}, *data.volume([recorder.host])]
+    if plan.secured:
+        volumes.append({"name": "tls", "secret": {"secretName": recorder.host, "defaultMode": READABLE}})
+    return _stateful_set(RECORDER_POD, "recorder", plan.command(recorder), volumes)
 
 
-def _stateful_set(
-    name: str, container: str, words: Sequence[str], volumes: Sequence[Document], mounted: Mapping[str, Document]
-) -> Document:
-    """A patch: the words that start a container, and volumes that it finds under their names."""
+def _stateful_set(name: str, container: str, words: Sequence[str], volumes: Sequence[Document]) -> Document:
+    """A patch: the words that start a container, and volumes that it finds under their names: its directory of each."""
     mounts = [
-        {"name": v["name"], "mountPath": f"{PLACE}/{v['name']}", "readOnly": True, **mounted.get(v["name"], {})}
-        for v in volumes
+        {
+            "name": volume["name"],
+            "mountPath": f"{PLACE}/{volume['name']}",
+            "readOnly": True,
+            **({"subPathExpr": NODE} if "projected" in volume else {}),
+        }
+        for volume in volumes
     ]
     own = {"name": container, "args": list(words[1:]), "volumeMounts": mounts}  # the image's entry point is zfusion
     return {
