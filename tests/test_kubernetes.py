@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +16,17 @@ import pytest
 import tomli_w
 import yaml
 
+from namespaces import hosts, why_none
 from services import EXAMPLE, ROOT, plan_of, tool
+from swarms import ZFUSION, Command, wait_until, zfusion
 from zfusion.deploy.folders import write
 from zfusion.deploy.kubernetes import write_component
 from zfusion.deploy.plan import Plan
 from zfusion.errors import InputError, ScenarioError
 
 KUBERNETES = ("1.31", "1.35")
+
+TROUBLE = why_none()
 
 Manifest = dict[str, Any]
 
@@ -169,6 +174,41 @@ def test_each_pod_sees_the_files_of_its_folder(cluster: Cluster) -> None:
 
 def files_in(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.skipif(TROUBLE is not None, reason=f"no network namespaces here: {TROUBLE}")
+def test_pods_find_each_other_by_their_names(tmp_path: Path) -> None:
+    """Each in a network namespace, with the files that it sees, started by its container's words, stopped as pods are.
+
+    The names that the headless service would give them are in an /etc/hosts of their own.
+    """
+    plan, _, manifests = deployed(tmp_path / "kubernetes", EXAMPLE)
+    with hosts(plan.hosts.hosts) as made, ExitStack() as stack:
+        table = tmp_path / "hosts"
+        table.write_text("".join(f"{made.addresses[name]} {host.address}\n" for name, host in plan.hosts.hosts.items()))
+        with_names = ("unshare", "--mount", "sh", "-c", 'mount --bind "$0" /etc/hosts && exec "$@"', str(table))
+        commands = {}
+        for process in plan.processes:
+            name = "zfusion-node" if process.kind == "node" else "zfusion-recorder"
+            (tmp_path / process.name / "recordings").mkdir(parents=True)
+            for path, data in seen_by(manifests, name, process.node).items():
+                (tmp_path / process.name / path).parent.mkdir(exist_ok=True)
+                (tmp_path / process.name / path).write_bytes(data)
+                (tmp_path / process.name / path).chmod(0o440)
+            words = [word.replace("$(NODE)", str(process.node)) for word in pods(manifests)[name][1]["args"]]
+            entrance = (*made.entrance(process.host), *with_names)
+            command = commands[process] = Command(tmp_path / process.name, *words, program=(*entrance, *ZFUSION))
+            stack.callback(command.wait)
+            stack.callback(command.process.kill)
+        recording = tmp_path / "recorder" / "recordings" / "field.mcap"
+        wait_until(lambda: recording.exists() and recording.stat().st_size > 40_000, "steps are on the recording")
+        for process, command in commands.items():
+            if process.kind == "node":
+                command.process.terminate()
+        assert {command.wait().code for command in commands.values()} == {0}
+    verdict = zfusion(tmp_path, "replay", recording, "--verify", "--json")
+    assert verdict.code == 0, verdict.out + verdict.err
+    assert {node for node, tally in verdict.summary["nodes"].items() if tally["identical"]} == {"1", "2", "3", "4"}
 
 
 def test_keys_are_for_the_pods_only(cluster: Cluster) -> None:
