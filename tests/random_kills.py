@@ -247,6 +247,6 @@ def check_the_counters(plan: Plan, counts: dict[str, int], summary: dict[str, An
     for node, completed in summary["completed_steps"].items():
         [on_file] = [count for topic, count in counts.items() if topic.split("/")[3] == node] or [0]
         missing = sum(number for topic, number in lost.items() if topic.endswith(f"{node}/estimate"))
-        # Of a life that was cut short the launcher knows what it said last.
+        # Of a life that was cut short the launcher knows what it told last, and its last estimate may not have left it.
         cut_short = plan.victim in (f"node {node}", "the network")
-        assert on_file + missing >= completed if cut_short else on_file + missing == completed, f"{plan}\n{summary}"
+        assert on_file + missing >= completed - 1 if cut_short else on_file + missing == completed, f"{plan}\n{summary}"
