@@ -222,7 +222,7 @@ def check_the_recording(fate: Fate, path: Path, died_ns: int, summary: dict[str,
         verdict = zfusion(directory, "replay", path, "--verify", "--json")
         assert verdict.out, f"{plan}\n{verdict.err}"
         assert verdict.summary["different"] == 0, f"{plan}\n{verdict.summary}"
-        if plan.victim == "the launcher":  # all nodes die with it
+        if plan.victim in {"the launcher", "the network"}:  # all nodes die with it
             assert_only_last_words_are_missing(verdict.summary, path)
         else:
             assert verdict.summary["unverifiable"] == 0 or recorder_killed or stopped, f"{plan}\n{verdict.summary}"
