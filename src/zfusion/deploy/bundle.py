@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 
 from zfusion.errors import Problem, ScenarioError
 from zfusion.model.scenario import Scenario
-from zfusion.model.schema.base import Spec
 from zfusion.model.types import NodeId
 
 DATA = "data"
@@ -75,21 +74,9 @@ class Bundle:
     def _needed(self, nodes: Collection[NodeId]) -> set[tuple[str, str]]:
         """(file, place) of what everybody reads, and of these nodes' own sources."""
         original = self._original
-        needed = {(path, self._places[path]) for path in _paths_of(original.links) | _paths_of(original.method)}
+        needed = {(path, self._places[path]) for path in (*original.links.paths(), *original.method.paths())}
         sources = {i: sensor.source or original.source for sensor in original.sensors for i in sensor.members}
         for i in nodes:
-            own = _paths_of(sources[i])
+            own = sources[i].paths()
             needed |= {(path.replace(EACH, str(i)), self._places[path].replace(EACH, str(i))) for path in own}
         return needed
-
-
-def _paths_of(piece: Spec) -> set[str]:
-    """The paths in a piece of a scenario."""
-    found: set[str] = set()
-
-    def note(path: str) -> str:
-        found.add(path)
-        return path
-
-    piece.with_paths(note)
-    return found

@@ -186,15 +186,8 @@ class Scenario(Spec):
 
     def files_read(self) -> list[Path]:
         """The files that it names for nodes and links to read: recordings, tables, code, traces, designs, keys."""
-        named: list[Path] = []
-
-        def note(path: str) -> str:
-            named.append(self.absolute(path))
-            return path
-
-        for piece in (*map(self.source_of, self.ids), self.transport, self.links, self.method):
-            piece.with_paths(note)
-        return named
+        pieces = (*map(self.source_of, self.ids), self.transport, self.links, self.method)
+        return [self.absolute(path) for piece in pieces for path in piece.paths()]
 
     @property
     def truth_known(self) -> bool:

@@ -69,6 +69,17 @@ class Spec(BaseModel):
         paths = {name: getattr(self, name) for name in self.PATHS}
         return self.model_copy(update={name: changed(path) for name, path in paths.items() if path is not None})
 
+    def paths(self) -> list[str]:
+        """The files that it names, pieces within it included."""
+        found: list[str] = []
+
+        def note(path: str) -> str:
+            found.append(path)
+            return path
+
+        self.with_paths(note)
+        return found
+
     @classmethod
     def model_validate(cls, obj: Any, **_: Any) -> Self:
         """The piece that `obj`, a table as read from a TOML file, describes."""

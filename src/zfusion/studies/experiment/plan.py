@@ -8,7 +8,6 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import tomli_w
@@ -185,15 +184,6 @@ def _hash(facts: Mapping[str, Any]) -> str:
 
 def _files(scenario: Scenario) -> list[tuple[str, str]]:
     """Names and SHA-256 of the files that a scenario reads, in its order; where they are does not matter."""
-    found: list[tuple[str, str]] = []
-
-    def note(path: str) -> str:
-        if Path(path).is_file():
-            found.append((Path(path).name, hashlib.sha256(Path(path).read_bytes()).hexdigest()))
-        return path
-
-    for i in scenario.ids:
-        scenario.source_of(i).with_paths(note)
-    for piece in (scenario.links, scenario.method):
-        piece.with_paths(lambda path: note(str(scenario.absolute(path))))
-    return found
+    pieces = (*map(scenario.source_of, scenario.ids), scenario.links, scenario.method)
+    files = [scenario.absolute(path) for piece in pieces for path in piece.paths()]
+    return [(file.name, hashlib.sha256(file.read_bytes()).hexdigest()) for file in files if file.is_file()]
