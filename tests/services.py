@@ -15,7 +15,7 @@ import yaml
 
 from zfusion.deploy.compose import PLACE as IN_CONTAINER
 from zfusion.deploy.compose import write_compose
-from zfusion.deploy.folders import write
+from zfusion.deploy.folders import write, write_readmes
 from zfusion.deploy.hosts import HostsFile
 from zfusion.deploy.plan import Plan
 from zfusion.deploy.systemd import PLACE, PROGRAM, write_units
@@ -59,7 +59,7 @@ class Service:
 
 def write_all(plan: Plan, directory: Path) -> None:
     """The folders of a plan as the command writes them."""
-    write(plan, directory, more=(write_units, write_compose))
+    write(plan, directory, more=(write_readmes, write_units, write_compose))
 
 
 def services_of(kind: str, plan: Plan, out: Path) -> Iterator[Service]:

@@ -22,7 +22,7 @@ def deploy(
 ) -> None:
     """Write a folder for every host: scenario, Zenoh configurations, certificates and keys, access control, units."""
     from zfusion.deploy.compose import write_compose
-    from zfusion.deploy.folders import write
+    from zfusion.deploy.folders import write, write_readmes
     from zfusion.deploy.hosts import HostsFile
     from zfusion.deploy.kubernetes import write_component
     from zfusion.deploy.plan import Plan
@@ -35,7 +35,7 @@ def deploy(
         Plan(loaded, placed, check_run(placed.run or scenario.stem)),
         output,
         renew=renew,
-        more=(write_component,) if placed.kubernetes else (write_units, write_compose),
+        more=(write_component,) if placed.kubernetes else (write_readmes, write_units, write_compose),
     )
 
     def show() -> None:

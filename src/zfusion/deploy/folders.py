@@ -144,9 +144,13 @@ def _write_folders(plan: Plan, directory: Path, identities: Identities | None) -
             yield folder / process.zenoh_file
             if identities is not None:
                 yield from identities.write(process)
-        if not plan.hosts.kubernetes:
-            (folder / "README").write_text(_readme(plan, name))
-            yield folder / "README"
+
+
+def write_readmes(plan: Plan, directory: Path) -> Iterator[Path]:
+    """Write what to do into the folder of every host; the files."""
+    for host in plan.hosts.hosts:
+        (directory / host / "README").write_text(_readme(plan, host))
+        yield directory / host / "README"
 
 
 def _remove(directory: Path, file: str) -> bool:

@@ -164,9 +164,10 @@ class HostsFile(Spec):
             raise ScenarioError(str(path), [Problem("file", str(path), f"expected valid TOML: {error}")]) from None
         hosts = cls._read(document, str(path))
         problems = list(_kind(hosts, scenario))
-        if not problems and hosts.kubernetes:
-            hosts = hosts.model_copy(update={"hosts": pods(scenario)})
-        problems = problems or list(problems_of(hosts, scenario))
+        if not problems:
+            placed = pods(scenario) if hosts.kubernetes else hosts.hosts
+            hosts = hosts.model_copy(update={"hosts": placed})
+            problems += problems_of(hosts, scenario)
         if problems:
             raise ScenarioError(str(path), problems)
         return hosts._anchored(path.parent.absolute())
