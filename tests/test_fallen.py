@@ -37,7 +37,7 @@ def fell(child: Child, until_step: int | None, until_ns: int | None = None, kind
 
 def swarm(*parts: tuple[int, ...], paced: bool = False) -> tuple[dict[Any, Child], Fallen]:
     nodes: dict[Any, Child] = {node: child(node) for part in parts for node in part}
-    return nodes, Fallen(nodes, [frozenset(part) for part in parts], paced)
+    return nodes, Fallen(nodes, {node: frozenset(part) for part in parts for node in part}, paced)
 
 
 def names(children: list[Child]) -> list[object]:

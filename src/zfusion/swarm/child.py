@@ -49,9 +49,9 @@ class Child:
     exit_code: int | None = None
     restarts: int = 0
     resumes: bool = False
-    """Whether it was told to begin in the midst of the run."""
+    """Whether it was told, while it waited, to begin in the midst of the run; where steps have times."""
     first_step: int | None = None
-    """With which step, where steps have no times."""
+    """With which step it was started to begin in the midst of the run, where they have none."""
     blow: Mapping[str, Any] | None = None
     """What has felled it by plan, as `misfortune.Blow`, until it is raised again."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from typing import Any
 
@@ -20,9 +20,9 @@ BLINK_S = 0.002
 class Fallen:
     """Of a swarm's nodes, those that were felled. They are told apart by `Child.blow`."""
 
-    def __init__(self, nodes: Mapping[NodeId, Child], parts: Collection[frozenset[NodeId]], paced: bool) -> None:
-        """`parts` are nodes that are connected with each other; whether steps have times (`paced`)."""
-        self._nodes, self._parts, self._paced = nodes, parts, paced
+    def __init__(self, nodes: Mapping[NodeId, Child], part_of: Mapping[NodeId, frozenset[NodeId]], paced: bool) -> None:
+        """`part_of`: whom each node is connected with, itself included; whether steps have times (`paced`)."""
+        self._nodes, self._part_of, self._paced = nodes, part_of, paced
 
     def due(self, now_ns: int) -> tuple[list[Child], float]:
         """Those that are to be raised now; and the seconds until the next one may have to be."""
@@ -45,7 +45,8 @@ class Fallen:
         None where the time tells it, or one of those that it is connected with, for that takes steps. If none does they
         all begin with one step.
         """
-        part = next(part for part in self._parts if child.node in part)
+        assert child.node is not None  # only nodes are felled
+        part = self._part_of[child.node]
         standing = [self._nodes[i] for i in part if self._nodes[i].running]
         if self._paced or any(other.status.get("phase") == "running" for other in standing):
             return None
@@ -54,7 +55,7 @@ class Fallen:
 
     def returns(self, last_step: int) -> bool:
         """Whether, with no node running, some will all the same: all that they are connected with have fallen, too."""
-        for part in self._parts:
+        for part in self._part_of.values():
             nodes = [self._nodes[i] for i in part]
             ended = any(child.exit_code == 0 for child in nodes)
             if not ended and min(_returns(nodes), default=inf) <= last_step:

@@ -89,8 +89,9 @@ class Launcher:
         self._clock.keep()
         self._standstill = Standstill()
         links = links_of(scenario)
-        self._parts = {connected(i, links) for i in scenario.ids}
-        """Nodes that wait for each other."""
+        self._part_of = {i: connected(i, links) for i in scenario.ids}
+        """Those that a node waits for, or is waited for by: whom it is connected with, itself included."""
+        self._paced = scenario.timing.period_ns is not None
         self._dismissed: set[str] = set()
         """Nodes that were told to end before they had begun."""
         self._begun = False
@@ -113,7 +114,7 @@ class Launcher:
         )
         self._network, self._recorder = self._processes.network, self._processes.recorder
         self._nodes = self._processes.nodes
-        self._fallen = Fallen(self._nodes, self._parts, scenario.timing.period_ns is not None)
+        self._fallen = Fallen(self._nodes, self._part_of, self._paced)
 
     def run(self) -> RunResult:
         """Start all, watch until all nodes have ended, finish the recording.
@@ -172,19 +173,15 @@ class Launcher:
             entrance = self._network.status["enter"][child.place]
         where = self._where_it_was(child) if first_step is None else ("--first-step", str(first_step))
         line = child.start(entrance, where)
-        child.first_step, child.resumes = first_step, first_step is not None
+        child.first_step = first_step
         self._selector.register(line.socket, selectors.EVENT_READ, child)
 
     def _where_it_was(self, child: Child) -> Sequence[str]:
         """What has a node of paced steps, started again, go on with the one that is due where no other can tell it."""
-        if len(self._part_of(child)) != 1 or child.epoch_ns is None or self._scenario.timing.period_ns is None:
+        if child.node is None or len(self._part_of[child.node]) > 1 or child.epoch_ns is None or not self._paced:
             return ()
         epoch_s = self._clock.on_machine(child.epoch_ns) / 1e9
         return "--epoch", datetime.fromtimestamp(epoch_s, UTC).isoformat()
-
-    def _part_of(self, child: Child) -> frozenset[NodeId]:
-        """The nodes that a node is connected with, itself included; none for who is no node."""
-        return next((part for part in self._parts if child.node in part), frozenset())
 
     def _watch_nodes(self) -> None:
         """Until every node's process has ended for good, or will not."""
@@ -213,7 +210,7 @@ class Launcher:
         """Have nodes end, or begin together, that would wait for ever for those that they are to join."""
         if self._stop_by is not None:
             return  # they all end, wherever they are
-        for part in self._parts:
+        for part in set(self._part_of.values()):
             nodes = [self._nodes[i] for i in part]
             if left := bereft(nodes):
                 self._reunite(left, min(child.epoch_ns for child in nodes if child.epoch_ns is not None))
@@ -224,9 +221,9 @@ class Launcher:
 
     def _reunite(self, left: Sequence[Child], epoch_ns: int) -> None:
         """Have nodes go on together that all died at about the same time, where steps have times: else all is lost."""
-        if self._scenario.timing.period_ns is None:
+        if not self._paced:
             for child in left:
-                if not child.resumes:
+                if child.first_step is None:
                     self._dismiss(child, f"{child.name} found nobody to join: all had died at about the same time")
             return
         for child in left:
@@ -344,7 +341,7 @@ class Launcher:
         return (
             self._options.restart
             and child.node is not None
-            and (self._scenario.timing.period_ns is not None or len(self._part_of(child)) > 1)
+            and (self._paced or len(self._part_of[child.node]) > 1)
             and self._begun
             and self._stop_by is None
             and child.restarts < MAX_RESTARTS
