@@ -123,4 +123,4 @@ def _clock(answer: Answer, clock: Clock, limit_ns: int | None) -> Iterator[Findi
 
 def _in_words(duration_ns: float) -> str:
     """In milliseconds, or in seconds to the millisecond."""
-    return f"{duration_ns / 1e6:.3g} ms" if duration_ns < 1e9 else f"{duration_ns / 1e9:.3f} s"
+    return f"{duration_ns / 1e6:.3g} ms" if duration_ns < 999.5e6 else f"{duration_ns / 1e9:.3f} s"

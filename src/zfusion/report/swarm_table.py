@@ -36,6 +36,9 @@ MOST_MACHINE = 16
 GAP = 2
 """Columns of the terminal between two of the table's; half of it on either edge."""
 
+SECONDS_US = 999_500
+"""From which offset on clocks are apart by seconds: how sure that is does not matter then."""
+
 STYLES = {"running": "green", "recording": "green", "joining": "yellow", "silent": "yellow", "done": "blue"}
 ABSENT = {"missing": "red", "gone": "red", "left": "dim"}
 
@@ -175,6 +178,8 @@ def _clock(clocks: Mapping[str, Mapping[str, float]]) -> str:
     if not clocks:
         return "?"
     offset, unsure = max(((c["offset_us"], c["uncertainty_us"]) for c in clocks.values()), key=lambda c: abs(c[0]))
+    if abs(offset) >= SECONDS_US:
+        return f"{offset / 1e6:+.3f} s"
     return f"{offset / 1000:+.3g} ± {unsure / 1000:.1g} ms" if offset or unsure else "same"
 
 
