@@ -1,39 +1,27 @@
-"""Fuzzers: some seconds of them here; for minutes, by Hypothesis,
-
-    ZFUSION_FUZZ=200000 python -m pytest -m long tests/test_fuzzing.py
-
-or guided by coverage with Atheris, see `fuzzing`.
+"""Fuzzers of what reads what peers send: for some time here, for longer as `drawing` says, or guided by coverage with
+Atheris, as `fuzzing` says. That of recordings is in `test_recover`.
 """
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from random import Random
 
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drawing import TIMEOUT_S, fuzz
 from fuzzing import TARGETS, node, wire
 from zfusion.messages import Reason
 
-MANY = int(os.environ.get("ZFUSION_FUZZ", "20000"))
 
-data = st.binary(max_size=600)
-
-
-@settings(max_examples=400, deadline=None)
-@given(data)
-def test_whatever_comes_is_read_or_refused(said: bytes) -> None:
-    wire(said)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.binary(min_size=50, max_size=600))
-def test_a_node_keeps_its_books_among_neighbours_that_say_anything(said: bytes) -> None:
-    node(said)
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
+def test_fuzz(target: Callable[[bytes], object]) -> None:
+    """Whatever comes is read or refused; a node keeps its books among neighbours that say anything."""
+    fuzz(target, st.binary(max_size=600) | st.binary(min_size=50, max_size=3000))
 
 
 def test_the_fuzzers_get_somewhere() -> None:
@@ -48,12 +36,3 @@ def test_the_fuzzers_get_somewhere() -> None:
     assert not [name for name in common if not seen[name]]
     assert steps > 30
     assert late > 30
-
-
-@pytest.mark.long
-@pytest.mark.timeout(7200)
-@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
-def test_for_minutes(target: Callable[[bytes], object]) -> None:
-    settings(max_examples=MANY, deadline=None, suppress_health_check=list(HealthCheck))(
-        given(st.binary(max_size=3000))(lambda said: target(said) and None)
-    )()

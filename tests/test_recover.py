@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import msgpack
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from drawing import TIMEOUT_S, fuzz
 from recordings import START_NS, Sent, contents, open_writer, read_plainly, record, traffic
 from simulations import record as record_simulation
 from zfusion.drivers.replayed import verify
@@ -282,11 +282,9 @@ def test_a_long_tail_of_nothing_is_not_taken_into_memory(tmp_path: Path, origina
 # --- fuzzing ----------------------------------------------------------------------------------------------------
 
 
-def fuzz(examples: int, tmp_path: Path, original: Original) -> None:
-    kinds = st.lists(st.tuples(st.sampled_from(DAMAGES), st.integers(0, 2**32)), min_size=1, max_size=8)
-
-    @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck))
-    @given(kinds)
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+def test_fuzz_any_damages(tmp_path: Path, original: Original) -> None:
     def damaged_in_many_ways(damages: list[tuple[Callable[[bytes, Random], bytes], int]]) -> None:
         data = original.data
         for damage, seed in damages:
@@ -294,14 +292,5 @@ def fuzz(examples: int, tmp_path: Path, original: Original) -> None:
                 data = damage(data, Random(seed))
         check(tmp_path, original, data)
 
-    damaged_in_many_ways()
-
-
-def test_any_damages(tmp_path: Path, original: Original) -> None:
-    fuzz(15, tmp_path, original)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(3600)
-def test_any_damages_for_long(tmp_path: Path, original: Original) -> None:
-    fuzz(20_000, tmp_path, original)
+    one = st.tuples(st.sampled_from(DAMAGES), st.integers(0, 2**32))
+    fuzz(damaged_in_many_ways, st.lists(one, min_size=1, max_size=8))
