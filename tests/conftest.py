@@ -7,8 +7,3 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 # Hundreds of processes are started, and each of them would compile all of zfusion where it must not keep the outcome.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are processors: those of tests of the network wait most of the time. Four at most."""
-    return (os.cpu_count() or 1) + 1
