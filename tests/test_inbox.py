@@ -124,6 +124,17 @@ def test_a_notice_ends_a_wait(pair: Pair) -> None:
         assert pair.inbox.notices.popleft() == number
 
 
+def test_notices_that_are_left_while_others_are_taken_are_for_the_next_time(pair: Pair) -> None:
+    for notice in (1, None, 2):
+        pair.inbox.notify(notice)
+    taken = []
+    for number in pair.inbox.take_notices():
+        pair.inbox.notify(number + 10)
+        taken.append(number)
+    assert taken == [1, 2]
+    assert list(pair.inbox.take_notices()) == [11, 12]
+
+
 def test_a_notice_that_is_there_lets_nobody_wait(pair: Pair) -> None:
     pair.subscribe("a")
     pair.inbox.notify("note")

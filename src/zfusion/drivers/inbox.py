@@ -185,6 +185,16 @@ class Inbox:
         self._alarm.set()
         self._nudge.set()
 
+    def take_notices(self) -> Iterator[Any]:
+        """The notices that are there now, taken as they are asked for; None, which only ends waits, is left out.
+
+        Others may be left meanwhile, by any thread: they are for the next time.
+        """
+        for _ in range(len(self.notices)):
+            notice = self.notices.popleft()
+            if notice is not None:
+                yield notice
+
     def arrived(self, source: Hashable, read: Callable[[bytes], Content | None]) -> Iterator[tuple[Content, Letter]]:
         """The messages that have arrived and of which `read` makes anything, taken as they are asked for.
 

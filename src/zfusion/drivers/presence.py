@@ -190,7 +190,7 @@ class Presence:
 
     def close(self) -> None:
         """Answer nothing any more."""
-        for kind, about, _ in filter(None, self._inbox.notices):
+        for kind, about, _ in self._inbox.take_notices():
             if kind in QUESTIONS:
                 about.drop()
 
@@ -217,12 +217,7 @@ class Presence:
 
     def handle_notices(self) -> None:
         """Act on all that has happened."""
-        notices = self._inbox.notices
-        for _ in range(len(notices)):
-            notice = notices.popleft()
-            if notice is None:
-                continue
-            kind, about, at_ns = notice
+        for kind, about, at_ns in self._inbox.take_notices():
             try:
                 self._handlers[kind](self, about, at_ns)
             except MessageError as error:

@@ -247,12 +247,7 @@ class Recorder:
 
     def _handle_notices(self) -> None:
         """Act on what happened."""
-        notices = self._inbox.notices
-        for _ in range(len(notices)):
-            notice = notices.popleft()
-            if notice is None:
-                continue
-            kind, about = notice
+        for kind, about in self._inbox.take_notices():
             if kind == "token":
                 self._on_token(about)
             else:
